@@ -1,0 +1,62 @@
+"""Trajectories for MuJoCo models by equality-constrained Langevin diffusion.
+
+>>> problem = mjx_drax.from_mjcf("robot.xml", running_cost=..., terminal_cost=..., horizon=2.0)
+>>> solution = mjx_drax.solve(problem, chains=256, seed=0)
+>>> mjx_drax.render(solution, "out.mp4")
+
+Names are loaded when they are first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mjx_drax.barrier import LogBarrier as LogBarrier
+    from mjx_drax.errors import DraxError as DraxError
+    from mjx_drax.langevin import Langevin as Langevin
+    from mjx_drax.mjcf import from_mjcf as from_mjcf
+    from mjx_drax.precondition import GaussNewton as GaussNewton
+    from mjx_drax.precondition import Identity as Identity
+    from mjx_drax.problem import Problem as Problem
+    from mjx_drax.problem import Trajectory as Trajectory
+    from mjx_drax.problem import from_function as from_function
+    from mjx_drax.rendering import render as render
+    from mjx_drax.schedules import Constant as Constant
+    from mjx_drax.schedules import Geometric as Geometric
+    from mjx_drax.solution import Solution as Solution
+    from mjx_drax.solution import solve as solve
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "LogBarrier": "barrier",
+    "DraxError": "errors",
+    "Langevin": "langevin",
+    "from_mjcf": "mjcf",
+    "GaussNewton": "precondition",
+    "Identity": "precondition",
+    "Problem": "problem",
+    "Trajectory": "problem",
+    "from_function": "problem",
+    "render": "rendering",
+    "Constant": "schedules",
+    "Geometric": "schedules",
+    "Solution": "solution",
+    "solve": "solution",
+}
+
+__all__ = sorted(_HOME)  # noqa: PLE0604
+
+if not (Path(__file__).parent / "tasks").is_dir():  # a checkout: tasks and models lie beside us
+    __path__.append(str(Path(__file__).parents[1]))
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'mjx_drax' has no attribute {name!r}")
+    value = getattr(import_module(f"mjx_drax.{_HOME[name]}"), name)
+    globals()[name] = value  # in place of the submodule that may carry the same name
+    return value

@@ -1,0 +1,22 @@
+"""One place that imports MuJoCo, so that a broken MUJOCO_GL gives one clear sentence.
+
+With MUJOCO_GL set to a platform whose libraries are missing, `import mujoco` itself fails deep
+inside PyOpenGL.
+"""
+
+from __future__ import annotations
+
+import os
+
+APT_EGL = "apt-get install -y --no-install-recommends libegl1 libopengl0 libgl1-mesa-dri"
+
+try:
+    import mujoco as mujoco
+except (AttributeError, ImportError) as error:
+    _backend = os.environ.get("MUJOCO_GL")
+    if not _backend:
+        raise
+    raise ImportError(
+        f"MUJOCO_GL={_backend} is set, but its libraries cannot be loaded ({error}): "
+        f"unset MUJOCO_GL, or run `{APT_EGL}` (for osmesa: libosmesa6)"
+    ) from error

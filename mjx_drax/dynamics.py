@@ -1,0 +1,153 @@
+"""Discrete-time dynamics x_{k+1} = f(x_k, u_k), and the arithmetic of its states.
+
+A state x holds nx numbers. Differences between states live in the tangent space and hold ndx
+numbers; for the vector spaces of this module the two are the same. Everything that is solved for
+(defects, linearizations, multipliers, noise) lives in tangent space, so a state with quaternions
+only has to bring its own `difference` and `integrate`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import Partial, register_dataclass
+
+Static: dict[str, Any] = {"static": True}
+
+
+class Dynamics:
+    """What the solver asks of a system: sizes, f, state arithmetic and what costs see.
+
+    Attributes:
+        nx: numbers in a state.
+        ndx: numbers in a difference of states.
+        nu: numbers in a control.
+        dt: time between knots [s].
+    """
+
+    nx: int
+    ndx: int
+    nu: int
+    dt: float
+
+    def step(self, x: Array, u: Array) -> Array:
+        """f(x, u): the state (nx,) one knot after x (nx,) under the control u (nu,)."""
+        raise NotImplementedError
+
+    def difference(self, x: Array, y: Array) -> Array:
+        """x - y in the tangent space at y, (ndx,), so that integrate(y, x - y) = x."""
+        return x - y
+
+    def integrate(self, x: Array, dx: Array) -> Array:
+        """x + dx: the state (nx,) reached from x (nx,) along the tangent vector dx (ndx,)."""
+        return x + dx
+
+    def observe(self, x: Array, u: Array) -> Any:
+        """What cost functions receive for the knot (x, u): here the state itself."""
+        return x
+
+    @property
+    def engine(self) -> str:
+        """What replays a result, in words."""
+        raise NotImplementedError
+
+    def replay(
+        self,
+        plan: np.ndarray,
+        u: np.ndarray,
+        gains: np.ndarray,
+        limits: tuple[np.ndarray, np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Run u_k + K_k (x_k - plan_k), clipped to the control limits, in float64.
+
+        Args:
+            plan: planned states x_0..x_K, (chains, K + 1, nx); each replay starts at its x_0.
+            u: planned controls, (chains, K, nu).
+            gains: feedback K_k, (chains, K, nu, ndx); zeros replay open loop.
+            limits: (lower, upper), each broadcastable to (K, nu).
+
+        Returns:
+            states (chains, K + 1, nx) and the controls that were applied (chains, K, nu).
+        """
+        raise NotImplementedError
+
+    def observe_replayed(self, x: np.ndarray) -> Any:
+        """What goal functions receive for a replayed state (nx,): here the state itself."""
+        return x
+
+
+def as_partial(function: Callable[..., Any]) -> Partial:
+    """The function as a pytree: static code, traced arguments.
+
+    A `jax.tree_util.Partial` given by the user keeps its bound arguments as traced leaves, which
+    is how a cost or a model takes parameters that may change without recompiling.
+    """
+    return function if isinstance(function, Partial) else Partial(function)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class FunctionDynamics(Dynamics):
+    """Dynamics given as a JAX function f(x (nx,), u (nu,)) -> x_next (nx,) on a vector space."""
+
+    function: Partial
+    dt: float
+    nx: int = field(metadata=Static)
+    nu: int = field(metadata=Static)
+
+    @property
+    def ndx(self) -> int:  # type: ignore[override]
+        """Differences of vectors are vectors."""
+        return self.nx
+
+    def step(self, x: Array, u: Array) -> Array:
+        """f(x, u), (nx,)."""
+        return self.function(x, u)
+
+    @property
+    def engine(self) -> str:
+        """Functions are rolled out in double precision."""
+        return "rollout of f, float64"
+
+    def replay(
+        self,
+        plan: np.ndarray,
+        u: np.ndarray,
+        gains: np.ndarray,
+        limits: tuple[np.ndarray, np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """States and controls under u_k + K_k (x_k - plan_k) with f in float64; see `Dynamics`."""
+        with jax.enable_x64(True):
+            states, applied = _replay(*jax.tree.map(_double, (self, plan, u, gains, limits)))
+            return np.asarray(states), np.asarray(applied)
+
+
+def _double(leaf: Any) -> Any:
+    """The same number or array in float64, if it is one of floats."""
+    array = np.asarray(leaf)
+    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else leaf
+
+
+@jax.jit
+def _replay(
+    dynamics: Dynamics, plan: Array, u: Array, gains: Array, limits: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    lower, upper = (jnp.broadcast_to(side, u.shape[1:]) for side in limits)
+
+    def advance(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        planned, control, gain, low, high = stage
+        control = jnp.clip(control + gain @ dynamics.difference(x, planned), low, high)
+        x = dynamics.step(x, control)
+        return x, (x, control)
+
+    def chain(plan: Array, u: Array, gains: Array) -> tuple[Array, Array]:
+        states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, lower, upper))[1]
+        return jnp.concatenate([plan[:1], states]), applied
+
+    return jax.vmap(chain)(plan, u, gains)

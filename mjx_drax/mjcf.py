@@ -1,0 +1,397 @@
+"""Dynamics from a MuJoCo model: f(x, u) is one or more MJX steps, x = [qpos, qvel, act].
+
+The same model is stepped by MuJoCo's C engine, in float64, when a result is certified.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import register_dataclass
+from jax.typing import ArrayLike
+
+from mjx_drax._mujoco import mujoco
+from mjx_drax.dynamics import Dynamics, Static
+from mjx_drax.errors import DraxError
+from mjx_drax.problem import Problem, Trajectory, box, checked, cost_of, knots, scatter_box, vector
+
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    from mujoco import mjx  # announces on import that warp is missing; nothing here needs warp
+
+
+class HostModel:
+    """A `mujoco.MjModel` carried beside the numbers of a pytree.
+
+    It takes no part in any compiled computation, so all of them compare equal: a model loaded
+    again does not recompile.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HostModel)
+
+    def __hash__(self) -> int:
+        return hash(HostModel)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class MjxDynamics(Dynamics):
+    """f(x, u) = `substeps` steps of MJX under constant control, x = [qpos (nq), qvel (nv), act (na)].
+
+    Attributes:
+        model: the model on the device; its numbers (masses, gears, ...) are traced.
+        dt: time between knots [s], substeps times the model's timestep.
+        host: the model for MuJoCo's C engine.
+        substeps: physics steps in one control step.
+    """
+
+    model: mjx.Model
+    dt: float
+    host: HostModel = field(metadata=Static)
+    substeps: int = field(metadata=Static)
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The model that the C engine replays."""
+        return self.host.model
+
+    @property
+    def engine(self) -> str:
+        """What replays a result."""
+        return f"MuJoCo {mujoco.__version__} C engine, float64"
+
+    @property
+    def nx(self) -> int:  # type: ignore[override]
+        """nq + nv + na."""
+        return self.model.nq + self.model.nv + self.model.na
+
+    @property
+    def ndx(self) -> int:  # type: ignore[override]
+        """2 nv + na; equal to nx while joints are hinges and slides."""
+        return 2 * self.model.nv + self.model.na
+
+    @property
+    def nu(self) -> int:  # type: ignore[override]
+        """Number of actuators."""
+        return self.model.nu
+
+    def step(self, x: Array, u: Array) -> Array:
+        """f(x, u), (nx,)."""
+        return _step(self.model, self.substeps, x, u)
+
+    def observe(self, x: Array, u: Array) -> mjx.Data:
+        """`mjx.Data` at the knot after `mjx.forward`: what a cost does not read is not computed."""
+        return _observe(self.model, x, u)
+
+    def replay(
+        self,
+        plan: np.ndarray,
+        u: np.ndarray,
+        gains: np.ndarray,
+        limits: tuple[np.ndarray, np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`."""
+        lower, upper = (np.broadcast_to(side, u.shape[1:]) for side in limits)
+
+        def chain(c: int) -> tuple[np.ndarray, np.ndarray]:
+            model, data = self.mj_model, mujoco.MjData(self.mj_model)
+            states, applied = np.empty(plan.shape[1:]), np.empty(u.shape[1:])
+            states[0] = plan[c, 0]
+            _set_state(model, data, states[0])
+            for k in range(len(applied)):
+                wanted = u[c, k] + gains[c, k] @ (states[k] - plan[c, k])
+                applied[k] = data.ctrl[:] = np.clip(wanted, lower[k], upper[k])
+                mujoco.mj_step(model, data, self.substeps)
+                states[k + 1] = np.concatenate([data.qpos, data.qvel, data.act])
+            return states, applied
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            runs = list(pool.map(chain, range(len(u))))
+        return np.stack([run[0] for run in runs]), np.stack([run[1] for run in runs])
+
+    def observe_replayed(self, x: np.ndarray) -> mujoco.MjData:
+        """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
+        data = mujoco.MjData(self.mj_model)
+        _set_state(self.mj_model, data, x)
+        mujoco.mj_forward(self.mj_model, data)
+        return data
+
+
+def _set_state(model: mujoco.MjModel, data: mujoco.MjData, x: np.ndarray) -> None:
+    """Write x = [qpos, qvel, act] into the C engine's data."""
+    data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
+
+
+def _data(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
+    """`mjx.Data` holding a state (nx,) and a control (nu,)."""
+    qpos, qvel, act = jnp.split(x, [model.nq, model.nq + model.nv])
+    return mjx.make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
+
+
+@jax.jit
+def _observe(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
+    return mjx.forward(model, _data(model, x, u))
+
+
+def _step(model: mjx.Model, substeps: int, x: Array, u: Array) -> Array:
+    def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+        return mjx.step(model, data), None
+
+    data = jax.lax.scan(advance, _data(model, x, u), length=substeps)[0]
+    return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+
+_step = jax.jit(_step, static_argnums=1)  # one trace of f, shared by all that differentiate it
+
+
+def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
+    """A model from a file, an XML string or a `mujoco.MjModel`.
+
+    Raises:
+        DraxError: the file is missing or MuJoCo cannot compile it.
+    """
+    if isinstance(source, mujoco.MjModel):
+        return source
+    try:
+        if isinstance(source, str) and source.lstrip().startswith("<"):
+            return mujoco.MjModel.from_xml_string(source)
+        if not Path(source).is_file():
+            raise DraxError(f"there is no model file {str(source)!r}: check the path.")
+        return mujoco.MjModel.from_xml_path(str(source))
+    except ValueError as error:
+        if isinstance(error, DraxError):
+            raise
+        raise DraxError(f"MuJoCo cannot compile {str(source)[:80]!r}: {error}") from error
+
+
+def from_mjcf(
+    model: str | Path | mujoco.MjModel,
+    *,
+    horizon: float,
+    running_cost: Callable[..., Any] | None = None,
+    terminal_cost: Callable[..., Any] | None = None,
+    running_residual: Callable[..., Any] | None = None,
+    terminal_residual: Callable[..., Any] | None = None,
+    dt: float | None = None,
+    x_init: ArrayLike | None = None,
+    x_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    goal: Callable[[Any], Any] | None = None,
+    guess: Callable[[Array], Trajectory] | None = None,
+    name: str | None = None,
+) -> Problem:
+    """A problem whose dynamics are those of a MuJoCo model.
+
+    Costs see `mjx.Data` after `mjx.forward` (qpos, qvel, site and body positions, sensors, ...);
+    what they do not read is not computed. Joint ranges and control ranges of the model become
+    bounds, to which `x_bounds` and `u_bounds` are added.
+
+    Args:
+        model: MJCF file, XML string or `mujoco.MjModel`.
+        horizon: duration [s]; K = horizon / dt knots.
+        running_cost: l(data, u), a scalar, summed over the knots as it stands.
+        terminal_cost: phi(data), a scalar.
+        running_residual: r(data, u) (n,): adds 1/2 |r|^2 to the running cost.
+        terminal_residual: r(data) (n,): adds 1/2 |r|^2 to the terminal cost.
+        dt: control step [s], a multiple of the model's timestep; by default the multiple that comes
+            closest to 0.02 s.
+        x_init: x_0 = [qpos, qvel, act]; by default the model's first keyframe, else its default pose.
+        x_bounds: (lower, upper) on states, each broadcastable to (nx,).
+        u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
+        x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
+            rad for hinges, +-1 m for slides and +-5 (rad/s or m/s) for velocities about x_init.
+        u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
+        goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
+        guess: guess(key) -> Trajectory, instead of the scatter boxes.
+        name: used in files and tables; by default the model's name.
+
+    Raises:
+        DraxError: the model cannot be used (saying which element and why), or arguments misfit.
+    """
+    host = load(model)
+    name = name or str(_model_name(host))
+    _refuse_unsupported(host, name)
+    substeps = _substeps(host, dt)
+    dynamics = MjxDynamics(
+        _on_device(host), substeps * host.opt.timestep, HostModel(host), substeps
+    )
+    if x_init is None:
+        x_init = _default_state(host)
+    x0 = vector("x_init", x_init)
+    if x0.shape != (dynamics.nx,):
+        raise DraxError(
+            f"x_init has {x0.shape[0]} numbers; {name} has {dynamics.nx}: "
+            f"qpos ({host.nq}), qvel ({host.nv}), act ({host.na})."
+        )
+    reach = np.concatenate([_joint_reach(host), np.full(host.nv, 5.0), np.ones(host.na)])
+    bounds = _bounds(host, dynamics, x_bounds, u_bounds)
+    return checked(
+        Problem(
+            dynamics=dynamics,
+            running=cost_of(running_cost, running_residual),
+            terminal=cost_of(terminal_cost, terminal_residual),
+            x_init=x0,
+            bounds=bounds,
+            scatter=scatter_box(bounds, x0, jnp.asarray(reach), x_scatter, u_scatter),
+            goal=goal,
+            guess=guess,
+            horizon=knots(horizon, dynamics.dt),
+            name=name,
+        )
+    )
+
+
+def _model_name(model: mujoco.MjModel) -> str:
+    return model.names[: model.names.index(b"\0")].decode() or "model"
+
+
+def _substeps(model: mujoco.MjModel, dt: float | None) -> int:
+    """Physics steps in a control step of dt [s], which must be a multiple of the timestep."""
+    timestep = model.opt.timestep
+    if dt is None:
+        return max(1, round(0.02 / timestep))
+    if not (np.isfinite(dt) and dt > 0):
+        raise DraxError(f"dt is {dt}: give a positive number of seconds.")
+    substeps = round(dt / timestep)
+    if substeps < 1 or abs(substeps * timestep - dt) > 1e-6 * dt:
+        raise DraxError(
+            f"dt is {dt} s, not a multiple of the model's timestep {timestep} s: "
+            f"give {max(1, substeps) * timestep:g}."
+        )
+    return substeps
+
+
+def _default_state(model: mujoco.MjModel) -> np.ndarray:
+    """[qpos, qvel, act] of the first keyframe, or the default pose at rest."""
+    if model.nkey:
+        return np.concatenate([model.key_qpos[0], model.key_qvel[0], model.key_act[0]])
+    return np.concatenate([model.qpos0, np.zeros(model.nv + model.na)])
+
+
+def _joint_reach(model: mujoco.MjModel) -> np.ndarray:
+    """Half-widths (nq,) of the scatter of joint positions: pi for hinges, 1 m for slides."""
+    hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    return np.where(hinge, np.pi, 1.0)
+
+
+def _bounds(
+    model: mujoco.MjModel,
+    dynamics: MjxDynamics,
+    x_bounds: tuple[ArrayLike, ArrayLike] | None,
+    u_bounds: tuple[ArrayLike, ArrayLike] | None,
+) -> Any:
+    """The ranges of the model's joints, activations and controls, intersected with the user's."""
+    x_lower, x_upper = np.full(dynamics.nx, -np.inf), np.full(dynamics.nx, np.inf)
+    limited = model.jnt_limited.astype(bool)
+    where = model.jnt_qposadr[limited]
+    x_lower[where], x_upper[where] = model.jnt_range[limited].T
+    u_lower, u_upper = np.full(model.nu, -np.inf), np.full(model.nu, np.inf)
+    limited = model.actuator_ctrllimited.astype(bool)
+    u_lower[limited], u_upper[limited] = model.actuator_ctrlrange[limited].T
+    given = box(dynamics.nx, model.nu, x_bounds, u_bounds)
+    return box(
+        dynamics.nx,
+        model.nu,
+        (np.maximum(x_lower, given.x_lower), np.minimum(x_upper, given.x_upper)),
+        (np.maximum(u_lower, given.u_lower), np.minimum(u_upper, given.u_upper)),
+    )
+
+
+def _on_device(model: mujoco.MjModel) -> mjx.Model:
+    """The MJX model, without joint limit constraints.
+
+    Knots are bounded by the joint ranges, and inside them the C engine's limit forces are zero:
+    leaving the constraint rows out changes nothing at the knots and spares a solver in f. The C
+    engine keeps its limits, and the certificate would show a difference.
+    """
+    flags = model.opt.disableflags
+    try:
+        model.opt.disableflags = flags | mujoco.mjtDisableBit.mjDSBL_LIMIT
+        return mjx.put_model(model, impl="jax")
+    except (NotImplementedError, ValueError) as error:
+        raise DraxError(f"MJX does not support this model: {error}") from error
+    finally:
+        model.opt.disableflags = flags
+
+
+def _refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
+    """Raise a DraxError that names the first element this version cannot plan for."""
+    for j in range(model.njnt):
+        kind = mujoco.mjtJoint(model.jnt_type[j])
+        if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            word = {mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball"}[kind]
+            raise DraxError(
+                f"joint {model.joint(j).name!r} of {name} is a {word} joint: states with "
+                "quaternions are not supported yet. Use hinge and slide joints."
+            )
+    if model.nv == 0:
+        raise DraxError(f"{name} has no joints: there is nothing to move.")
+    if model.nu == 0:
+        raise DraxError(f"{name} has no actuators: add an <actuator>.")
+    if model.neq:
+        raise DraxError(
+            f"{name} has {model.neq} equality constraint(s): not supported yet. Remove them."
+        )
+    if (
+        np.any(model.tendon_limited)
+        or np.any(model.dof_frictionloss)
+        or np.any(model.tendon_frictionloss)
+    ):
+        raise DraxError(
+            f"{name} has dry friction or limited tendons: constraint forces are not supported yet. "
+            "Set frictionloss to 0 and tendons to unlimited."
+        )
+    if np.any(model.jnt_margin[model.jnt_limited.astype(bool)]):
+        raise DraxError(
+            f"{name} has joint limits with a margin, whose forces act inside the range: not "
+            "supported yet. Set margin to 0."
+        )
+    pair = _contact_pair(model)
+    if pair is not None:
+        raise DraxError(
+            f"geoms {pair[0]!r} and {pair[1]!r} of {name} can touch: contacts are not supported "
+            'yet. Give them contype="0" conaffinity="0", or <flag contact="disable"/>.'
+        )
+
+
+def _contact_pair(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Names of the first two geoms between which MuJoCo may make a contact, or None."""
+
+    def label(g: int) -> str:
+        return model.geom(g).name or f"geom {g}"
+
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return None
+    if model.npair:
+        return label(model.pair_geom1[0]), label(model.pair_geom2[0])
+    parents = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    weld = model.body_weldid
+    for a in range(model.ngeom):
+        for b in range(a + 1, model.ngeom):
+            masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
+                model.geom_contype[b] & model.geom_conaffinity[a]
+            )
+            wa, wb = weld[model.geom_bodyid[a]], weld[model.geom_bodyid[b]]
+            if not masks or wa == wb:
+                continue
+            pa, pb = (weld[model.body_parentid[w]] for w in (wa, wb))
+            if parents and wa and wb and (wa == pb or wb == pa):
+                continue
+            return label(a), label(b)
+    return None

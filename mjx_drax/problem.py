@@ -1,0 +1,458 @@
+"""The optimal control problem, and the knot points that answer it.
+
+    min  phi(x_K) + sum_k l(x_k, u_k)    s.t.  x_{k+1} = f(x_k, u_k),  x_0 = x_init,
+                                               x_lower <= x_k <= x_upper,  u_lower <= u_k <= u_upper
+
+(equation 1 of the paper, with bounds). k runs over 0..K-1 for controls and 1..K for the states that
+are solved for. There is no hidden factor dt: a running cost is summed over knots as it stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import Partial, register_dataclass
+from jax.typing import ArrayLike
+
+from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
+from mjx_drax.errors import DraxError
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
+    """Knot points: states x_1..x_K (..., K, nx) and controls u_0..u_{K-1} (..., K, nu)."""
+
+    x: Array
+    u: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Box:
+    """Lower and upper ends of states (nx,) or (K, nx) and controls (nu,) or (K, nu); +-inf is free."""
+
+    x_lower: Array
+    x_upper: Array
+    u_lower: Array
+    u_upper: Array
+
+    def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
+        """The lower and the upper end for every knot of a trajectory, as two trajectories."""
+        x, u = trajectory.x, trajectory.u
+        lower = Trajectory(
+            jnp.broadcast_to(self.x_lower, x.shape), jnp.broadcast_to(self.u_lower, u.shape)
+        )
+        upper = Trajectory(
+            jnp.broadcast_to(self.x_upper, x.shape), jnp.broadcast_to(self.u_upper, u.shape)
+        )
+        return lower, upper
+
+    def violation(self, trajectory: Trajectory) -> Array:
+        """Largest distance by which any knot leaves the box, 0 if none does, scalar."""
+        lower, upper = self.sides(trajectory)
+        out = jax.tree.map(
+            lambda z, a, b: jnp.maximum(jnp.max(a - z), jnp.max(z - b)), trajectory, lower, upper
+        )
+        return jnp.maximum(jnp.maximum(out.x, out.u), 0.0)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Cost:
+    """scalar(...) + 1/2 |residual(...)|^2, either part optional.
+
+    A residual is the better way to give a cost: its Gauss-Newton Hessian J'J is positive
+    semidefinite by construction and needs first derivatives only.
+    """
+
+    scalar: Partial | None
+    residual: Partial | None
+
+    def __call__(self, *arguments: Any) -> Array:
+        """The cost, a scalar."""
+        total = jnp.zeros(())
+        if self.scalar is not None:
+            total = total + self.scalar(*arguments)
+        if self.residual is not None:
+            total = total + 0.5 * jnp.sum(jnp.square(self.residual(*arguments)))
+        return total
+
+    def expand(self, at: Callable[[Array], tuple[Any, ...]], size: int) -> tuple[Array, Array]:
+        """Gradient (n,) and positive semidefinite Hessian (n, n) in local coordinates.
+
+        `at(dz)` gives the cost's arguments a displacement dz (n,) away from the knot. The residual
+        contributes J'r and J'J; the scalar its gradient, and its Hessian with negative eigenvalues
+        set to zero (the nearest positive semidefinite matrix in the Frobenius norm).
+        """
+        zero = jnp.zeros(size)
+        gradient, hessian = zero, jnp.zeros((size, size))
+        if self.scalar is not None:
+            scalar = self.scalar
+
+            def value(dz: Array) -> Array:
+                return scalar(*at(dz))
+
+            gradient = gradient + jax.jacfwd(value)(zero)
+            hessian = hessian + _positive_part(jax.jacfwd(jax.jacfwd(value))(zero))
+        if self.residual is not None:
+            residual = self.residual
+
+            def with_value(dz: Array) -> tuple[Array, Array]:
+                r = jnp.ravel(residual(*at(dz)))
+                return r, r
+
+            jacobian, r = jax.jacfwd(with_value, has_aux=True)(zero)
+            gradient = gradient + jacobian.T @ r
+            hessian = hessian + jacobian.T @ jacobian
+        return gradient, hessian
+
+
+def _positive_part(matrix: Array) -> Array:
+    """The nearest positive semidefinite matrix to a symmetric one (n, n)."""
+    values, vectors = jnp.linalg.eigh(0.5 * (matrix + matrix.T))
+    return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Problem:
+    """An optimal control problem. A pytree: functions, sizes and the horizon are static, every
+    number (x_init, bounds, model parameters, bound arguments of the costs) is traced.
+
+    Attributes:
+        dynamics: x_{k+1} = f(x_k, u_k).
+        running: l, called with (dynamics.observe(x, u), u).
+        terminal: phi, called with (dynamics.observe(x, 0),).
+        x_init: x_0, (nx,).
+        bounds: the box that every knot must keep to.
+        scatter: the box that initial knots are drawn from, uniformly.
+        goal: goal(dynamics.observe_replayed(x_K)) -> bool, or None: what a replay must reach.
+        guess: guess(key) -> Trajectory for one chain, or None: instead of `scatter`.
+        horizon: K, number of control knots.
+        name: what files and tables call it.
+    """
+
+    dynamics: Dynamics
+    running: Cost
+    terminal: Cost
+    x_init: Array
+    bounds: Box
+    scatter: Box
+    goal: Callable[[Any], Any] | None = field(metadata=Static)
+    guess: Callable[[Array], Trajectory] | None = field(metadata=Static)
+    horizon: int = field(metadata=Static)
+    name: str = field(metadata=Static)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times of x_0..x_K, (K + 1,) [s]."""
+        return float(self.dynamics.dt) * np.arange(self.horizon + 1)
+
+    def running_cost(self, x: Array, u: Array) -> Array:
+        """l(x, u), scalar."""
+        return self.running(self.dynamics.observe(x, u), u)
+
+    def terminal_cost(self, x: Array) -> Array:
+        """phi(x), scalar."""
+        return self.terminal(self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)))
+
+    def stages(self, trajectory: Trajectory) -> Array:
+        """x_0..x_{K-1} (K, nx): the states that the controls act on."""
+        return jnp.concatenate([self.x_init[None], trajectory.x[:-1]])
+
+    def cost(self, trajectory: Trajectory) -> Array:
+        """phi(x_K) + sum_k l(x_k, u_k), scalar."""
+        running = jax.vmap(self.running_cost)(self.stages(trajectory), trajectory.u)
+        return jnp.sum(running) + self.terminal_cost(trajectory.x[-1])
+
+    def defects(self, trajectory: Trajectory) -> Array:
+        """h_k = f(x_k, u_k) - x_{k+1} in the tangent space at x_{k+1}, (K, ndx)."""
+
+        def defect(x: Array, u: Array, x_next: Array) -> Array:
+            return self.dynamics.difference(self.dynamics.step(x, u), x_next)
+
+        return jax.vmap(defect)(self.stages(trajectory), trajectory.u, trajectory.x)
+
+    def draw(self, key: Array) -> Trajectory:
+        """Random initial knots for one chain; they need not be feasible."""
+        if self.guess is not None:
+            return self.guess(key)
+        key_x, key_u = jax.random.split(key)
+        box, dynamics = self.scatter, self.dynamics
+        x = jax.random.uniform(key_x, (self.horizon, dynamics.nx))
+        u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
+        return Trajectory(
+            box.x_lower + x * (box.x_upper - box.x_lower),
+            box.u_lower + u * (box.u_upper - box.u_lower),
+        )
+
+    def reached(self, x: np.ndarray) -> bool | None:
+        """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.
+
+        Raises:
+            DraxError: the goal fails, or returns more than one truth value.
+        """
+        if self.goal is None:
+            return None
+        try:
+            reached = np.asarray(self.goal(self.dynamics.observe_replayed(x)))
+        except Exception as error:
+            raise DraxError(
+                f"goal failed at x = {x.tolist()}: {type(error).__name__}: {error}. It gets the "
+                "state of a function problem, or the mujoco.MjData of a model."
+            ) from error
+        if reached.size != 1:
+            raise DraxError(f"goal returned shape {reached.shape}: it must return one truth value.")
+        return bool(reached.item())
+
+    def with_x_init(self, x_init: ArrayLike) -> Problem:
+        """The same problem from another initial state (nx,)."""
+        return checked(replace(self, x_init=jnp.asarray(x_init, self.x_init.dtype)))
+
+
+def knots(horizon: float, dt: float) -> int:
+    """K, the number of control knots in a horizon [s] at a control step dt [s].
+
+    Raises:
+        DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
+    """
+    for label, value in (("dt", dt), ("horizon", horizon)):
+        if not (np.isfinite(value) and value > 0):
+            raise DraxError(f"{label} is {value}: give a positive number of seconds.")
+    count = round(horizon / dt)
+    if count < 1:
+        raise DraxError(
+            f"horizon is {horizon} s, shorter than one control step of {dt} s: give at least {dt} s."
+        )
+    return count
+
+
+def box(
+    nx: int,
+    nu: int,
+    x: tuple[ArrayLike, ArrayLike] | None = None,
+    u: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Box:
+    """A box from (lower, upper) pairs, scalars or arrays that broadcast to (nx,) and (nu,).
+
+    A side that is None is free.
+    """
+
+    def end(value: ArrayLike, size: int, label: str) -> Array:
+        try:
+            array = np.asarray(value, float)
+            shape = np.broadcast_shapes(array.shape, (size,))
+            return jnp.asarray(np.broadcast_to(array, shape))
+        except ValueError as error:
+            raise DraxError(
+                f"{label} is {value!r}: give numbers of shape ({size},), or one for all."
+            ) from error
+
+    free = (-jnp.inf, jnp.inf)
+    (xl, xu), (ul, uu) = x or free, u or free
+    return Box(
+        end(xl, nx, "lower end of x"),
+        end(xu, nx, "upper end of x"),
+        end(ul, nu, "lower end of u"),
+        end(uu, nu, "upper end of u"),
+    )
+
+
+def cost_of(cost: Callable[..., Any] | None, residual: Callable[..., Any] | None) -> Cost:
+    """A Cost from the functions that a user gives; either or both may be None."""
+    return Cost(
+        None if cost is None else as_partial(cost),
+        None if residual is None else as_partial(residual),
+    )
+
+
+def from_function(
+    f: Callable[[Array, Array], Array],
+    *,
+    x_init: ArrayLike,
+    nu: int,
+    dt: float,
+    horizon: float,
+    running_cost: Callable[..., Any] | None = None,
+    terminal_cost: Callable[..., Any] | None = None,
+    running_residual: Callable[..., Any] | None = None,
+    terminal_residual: Callable[..., Any] | None = None,
+    x_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    goal: Callable[[Any], Any] | None = None,
+    guess: Callable[[Array], Trajectory] | None = None,
+    name: str = "problem",
+) -> Problem:
+    """A problem whose dynamics are a JAX function f(x (nx,), u (nu,)) -> x_next (nx,).
+
+    Args:
+        f: the dynamics. Parameters that should stay changeable without recompiling are bound with
+            `jax.tree_util.Partial`; the same holds for the costs.
+        x_init: x_0, (nx,).
+        nu: size of a control.
+        dt: control step [s].
+        horizon: duration [s]; K = horizon / dt knots.
+        running_cost: l(x, u), a scalar, summed over the knots as it stands.
+        terminal_cost: phi(x), a scalar.
+        running_residual: r(x, u) (n,): adds 1/2 |r|^2 to the running cost.
+        terminal_residual: r(x) (n,): adds 1/2 |r|^2 to the terminal cost.
+        x_bounds: (lower, upper) on every x_k, k >= 1.
+        u_bounds: (lower, upper) on every u_k.
+        x_scatter: box from which initial states are drawn; by default the bounds, and within
+            +-1 of x_init where those are infinite.
+        u_scatter: the same for controls; within +-1 of 0 where the bounds are infinite.
+        goal: goal(x_K) -> bool, what a replay must reach.
+        guess: guess(key) -> Trajectory, instead of the scatter boxes.
+        name: used in files and tables.
+
+    Raises:
+        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one.
+    """
+    x_init = vector("x_init", x_init)
+    nx = x_init.shape[0]
+    bounds = box(nx, nu, x_bounds, u_bounds)
+    return checked(
+        Problem(
+            dynamics=FunctionDynamics(as_partial(f), dt, nx, nu),
+            running=cost_of(running_cost, running_residual),
+            terminal=cost_of(terminal_cost, terminal_residual),
+            x_init=x_init,
+            bounds=bounds,
+            scatter=scatter_box(bounds, x_init, jnp.ones(nx), x_scatter, u_scatter),
+            goal=goal,
+            guess=guess,
+            horizon=knots(horizon, dt),
+            name=name,
+        )
+    )
+
+
+def vector(label: str, value: ArrayLike) -> Array:
+    """A finite float vector (n,), or a DraxError that says what was given."""
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError) as error:
+        raise DraxError(f"{label} is {value!r}: give a vector of numbers.") from error
+    if array.ndim != 1 or not np.all(np.isfinite(array)):
+        raise DraxError(f"{label} is {value!r}: give a vector of finite numbers.")
+    return jnp.asarray(array)
+
+
+def scatter_box(
+    bounds: Box,
+    x_init: Array,
+    reach: Array,
+    x: tuple[ArrayLike, ArrayLike] | None,
+    u: tuple[ArrayLike, ArrayLike] | None,
+) -> Box:
+    """The box for initial knots: what is asked for, else the bounds, else x_init +- reach (nx,)."""
+    nx, nu = x_init.shape[0], bounds.u_lower.shape[-1]
+    given = box(nx, nu, x, u)
+
+    def pick(asked: Array, bound: Array, otherwise: Array) -> Array:
+        return jnp.where(
+            jnp.isfinite(asked), asked, jnp.where(jnp.isfinite(bound), bound, otherwise)
+        )
+
+    return Box(
+        pick(given.x_lower, bounds.x_lower, x_init - reach),
+        pick(given.x_upper, bounds.x_upper, x_init + reach),
+        pick(given.u_lower, bounds.u_lower, -jnp.ones(nu)),
+        pick(given.u_upper, bounds.u_upper, jnp.ones(nu)),
+    )
+
+
+def checked(problem: Problem) -> Problem:
+    """The problem, if sizes, bounds and functions fit together; traced abstractly, not compiled.
+
+    Raises:
+        DraxError: naming the cause, the value seen and the fix.
+    """
+    dynamics, bounds = problem.dynamics, problem.bounds
+    nx, nu = dynamics.nx, dynamics.nu
+    if nu < 1:
+        raise DraxError(f"{problem.name} has {nu} controls: a problem needs at least one actuator.")
+    if problem.x_init.shape != (nx,):
+        raise DraxError(
+            f"x_init has shape {problem.x_init.shape}, the dynamics have states of shape ({nx},)."
+        )
+    for label, lower, upper in (
+        ("x", bounds.x_lower, bounds.x_upper),
+        ("u", bounds.u_lower, bounds.u_upper),
+        ("scatter of x", problem.scatter.x_lower, problem.scatter.x_upper),
+        ("scatter of u", problem.scatter.u_lower, problem.scatter.u_upper),
+    ):
+        crossed = np.argwhere(~(np.asarray(lower) <= np.asarray(upper)))
+        if crossed.size:
+            i = tuple(int(j) for j in crossed[0])
+            raise DraxError(
+                f"bounds of {label} cross at element {i[-1]}: lower {float(lower[i])}, "
+                f"upper {float(upper[i])}. Give lower <= upper."
+            )
+    outside = float(
+        jnp.max(jnp.maximum(bounds.x_lower - problem.x_init, problem.x_init - bounds.x_upper))
+    )
+    if outside > 1e-6:
+        raise DraxError(
+            f"x_init = {np.asarray(problem.x_init).tolist()} lies outside the bounds of x by "
+            f"{outside:.3g}: move it inside, or widen the bounds."
+        )
+    if all(
+        part is None
+        for cost in (problem.running, problem.terminal)
+        for part in (cost.scalar, cost.residual)
+    ):
+        raise DraxError(f"{problem.name} has no cost: give a running or a terminal one.")
+    u = jax.ShapeDtypeStruct((nu,), problem.x_init.dtype)
+    x = jax.ShapeDtypeStruct((nx,), problem.x_init.dtype)
+    _check_shape("the dynamics f(x, u)", dynamics.step, (x, u), (nx,))
+    observed = jax.eval_shape(dynamics.observe, x, u)
+    for label, part, arguments in (
+        ("running_cost", problem.running.scalar, (observed, u)),
+        ("terminal_cost", problem.terminal.scalar, (observed,)),
+    ):
+        if part is not None:
+            _check_shape(label, part, arguments, ())
+    for label, part, arguments in (
+        ("running_residual", problem.running.residual, (observed, u)),
+        ("terminal_residual", problem.terminal.residual, (observed,)),
+    ):
+        if part is not None:
+            _check_shape(label, part, arguments, None)
+    problem.reached(np.asarray(problem.x_init, float))
+    return problem
+
+
+def _check_shape(
+    label: str,
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    shape: tuple[int, ...] | None,
+) -> None:
+    """Trace a user's function abstractly; complain if it fails or returns another shape."""
+    try:
+        out = jax.eval_shape(function, *arguments)
+    except DraxError:
+        raise
+    except Exception as error:
+        reason = str(error).strip().split("\n")[0] or type(error).__name__
+        raise DraxError(
+            f"{label} failed when it was traced: {type(error).__name__}: {reason}. It must be a "
+            "JAX function of its arguments (jax.numpy, no Python branches on values)."
+        ) from error
+    seen = getattr(out, "shape", None)
+    if seen is None or not jnp.issubdtype(out.dtype, jnp.floating):
+        raise DraxError(f"{label} returned {out}: it must return one array of floats.")
+    if shape is not None and seen != shape:
+        expected = "a scalar" if shape == () else f"shape {shape}"
+        hint = " (a vector cost goes in as a residual)" if shape == () else ""
+        raise DraxError(f"{label} returned shape {seen}, but must return {expected}{hint}.")

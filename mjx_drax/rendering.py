@@ -1,0 +1,422 @@
+"""Videos of a motion without a display: OpenGL through EGL or OSMesa, else the numpy painter.
+
+Importing this module touches neither OpenGL nor the environment. The first frame ever drawn
+decides how frames are drawn from then on: EGL (hardware, or Mesa's llvmpipe), then OSMesa, then
+`mjx_drax.painter` with one warning that names the missing packages. `MUJOCO_GL=egl` or `osmesa`
+restricts the choice to that one, `MUJOCO_GL=off` to the painter.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import os
+import platform
+import sys
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from mjx_drax._mujoco import APT_EGL, mujoco
+from mjx_drax.errors import DraxError
+
+if TYPE_CHECKING:
+    from PIL import ImageFont
+
+Frame = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.floating[Any]]
+
+_HOLD = 0.5  # [s] the last frame stays this long
+_CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
+_GL_OFF = ("off", "0", "false", "disable", "disabled")
+
+
+class Drawer(Protocol):
+    """Turns a scene into a frame (height, width, 3) uint8."""
+
+    def render(self, scene: mujoco.MjvScene) -> Frame:
+        """The scene as its camera sees it."""
+
+
+def render_motion(
+    model: mujoco.MjModel,
+    qpos: npt.ArrayLike,
+    times: npt.ArrayLike,
+    path: str | os.PathLike[str],
+    *,
+    overlay: Sequence[str] = (),
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+) -> Path:
+    """Writes a motion as an H.264 mp4 that browsers play, and returns its path.
+
+    The arguments are those of `render_frames`; `path` ends in .mp4, and its folder is made if
+    need be. The file appears once it is complete. Raises DraxError before anything is drawn.
+    """
+    target = _video_path(path)
+    frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
+    partial = target.with_name(f".{target.stem}.partial.mp4")
+    try:
+        partial.touch()
+    except OSError as error:
+        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
+
+    import imageio_ffmpeg
+    import mediapy
+
+    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())  # so that pip alone is enough
+    try:
+        with mediapy.VideoWriter(
+            partial, _even(size), fps=fps, crf=_CRF, ffmpeg_args=("-movflags", "+faststart")
+        ) as writer:
+            for frame in frames:
+                writer.add_image(frame)
+        partial.replace(target)
+    finally:
+        frames.close()
+        partial.unlink(missing_ok=True)
+    return target
+
+
+def render_frames(
+    model: mujoco.MjModel,
+    qpos: npt.ArrayLike,
+    times: npt.ArrayLike,
+    *,
+    overlay: Sequence[str] = (),
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+) -> Frame:
+    """Frames (N, height, width, 3) uint8 of a motion, the last one held for half a second.
+
+    Args:
+      model: what moves.
+      qpos: positions (T, nq), interpolated between their times (along geodesics for quaternions).
+      times: when they are reached (T,) [s], not decreasing.
+      overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
+      fps: frames per second.
+      size: (height, width) [pixels]; odd ones are made even, which players ask for.
+      camera: a camera's name or index; None takes the one called "main", or, in a model without
+        one, a free camera that frames the whole motion.
+
+    Raises:
+      DraxError: positions of the wrong shape or not finite, decreasing times, unknown camera.
+    """
+    frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
+    return np.stack(list(frames))
+
+
+def _frames(
+    model: mujoco.MjModel,
+    qpos: npt.ArrayLike,
+    times: npt.ArrayLike,
+    *,
+    overlay: Sequence[str],
+    fps: float,
+    size: tuple[int, int],
+    camera: str | int | None,
+) -> Generator[Frame, None, None]:
+    """Checks everything now, draws one frame at a time later."""
+    positions, instants = _checked_motion(model, qpos, times)
+    if not (np.isfinite(fps) and fps > 0.0):
+        raise DraxError(f"fps must be positive, not {fps}")
+    if isinstance(overlay, str):
+        raise DraxError(f"overlay is a sequence of lines, not one string: [{overlay!r}]")
+    height, width = _even(size)
+    view = _camera(model, positions, camera, width / height)
+    count = int((instants[-1] - instants[0]) * fps + 1e-6) + 1
+    at = instants[0] + np.arange(count) / fps
+    at = np.append(at, np.full(round(_HOLD * fps), instants[-1]))
+
+    def draw() -> Generator[Frame, None, None]:
+        data = mujoco.MjData(model)
+        scene = mujoco.MjvScene(model, maxgeom=10_000)
+        option = mujoco.MjvOption()
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        with _drawer(model, height, width) as drawer:
+            for time in at:
+                _pose(model, data, _interpolate(model, positions, instants, time))
+                mujoco.mjv_updateScene(model, data, option, None, view, everything, scene)
+                yield _write(drawer.render(scene), overlay, time)
+
+    return draw()
+
+
+def _checked_motion(
+    model: mujoco.MjModel, qpos: npt.ArrayLike, times: npt.ArrayLike
+) -> tuple[Floats, Floats]:
+    positions, instants = np.asarray(qpos, float), np.asarray(times, float)
+    if positions.ndim != 2 or positions.shape[1] != model.nq or len(positions) == 0:
+        raise DraxError(
+            f"qpos must have the shape (T, nq) = (T, {model.nq}), not {positions.shape}"
+        )
+    if instants.shape != (len(positions),):
+        raise DraxError(f"times must have the shape ({len(positions)},), not {instants.shape}")
+    if not np.all(np.isfinite(positions)):
+        row = int(np.argmin(np.isfinite(positions).all(axis=1)))
+        raise DraxError(f"qpos must be finite; row {row} is {positions[row]}")
+    if not np.all(np.isfinite(instants)) or np.any(np.diff(instants) < 0.0):
+        raise DraxError("times must be finite and must not decrease")
+    return positions, instants
+
+
+def _even(size: tuple[int, int]) -> tuple[int, int]:
+    """The size, rounded up to even numbers: yuv420p halves both sides."""
+    height, width = (int(side) for side in size)
+    if not (16 <= height <= 8192 and 16 <= width <= 8192):
+        raise DraxError(f"size (height, width) must lie within 16 and 8192 pixels, not {size}")
+    return height + height % 2, width + width % 2
+
+
+def _video_path(path: str | os.PathLike[str]) -> Path:
+    target = Path(path).expanduser()
+    if target.suffix.lower() != ".mp4":
+        raise DraxError(f"a video is written as .mp4, not {target.name!r}")
+    if target.is_dir():
+        raise DraxError(f"cannot write {target}: it is a folder")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
+    return target
+
+
+def _interpolate(model: mujoco.MjModel, qpos: Floats, times: Floats, time: float) -> Floats:
+    """Position (nq,) at a time [s], moving at constant velocity between knots."""
+    last = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
+    if last == len(times) - 1:
+        return qpos[last]
+    span = times[last + 1] - times[last]
+    velocity = np.zeros(model.nv)  # tangent vector: right for quaternions as well
+    mujoco.mj_differentiatePos(model, velocity, span, qpos[last], qpos[last + 1])
+    position = qpos[last].copy()
+    mujoco.mj_integratePos(model, position, velocity, time - times[last])
+    return position
+
+
+def _pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
+    """Sets the position and computes what a scene shows; no collisions, no forces."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+    mujoco.mj_tendon(model, data)
+
+
+# Cameras
+
+
+def _camera(
+    model: mujoco.MjModel, qpos: Floats, wanted: str | int | None, aspect: float
+) -> mujoco.MjvCamera:
+    names = [model.camera(index).name for index in range(model.ncam)]
+    if wanted is None:
+        if "main" not in names:
+            return _framing_camera(model, qpos, aspect)
+        wanted = "main"
+    index = names.index(wanted) if wanted in names else wanted
+    if isinstance(index, str) or not 0 <= index < model.ncam:
+        known = ", ".join(name or f"{i} (unnamed)" for i, name in enumerate(names)) or "none"
+        raise DraxError(f"no camera {wanted!r} in this model; its cameras: {known}")
+    view = mujoco.MjvCamera()
+    view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    view.fixedcamid = index
+    return view
+
+
+def _framing_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoco.MjvCamera:
+    """A free camera that sees every moving geom in every pose of the motion."""
+    data = mujoco.MjData(model)
+    sized = model.geom_rbound > 0.0  # planes have none
+    moving = sized & (model.body_weldid[model.geom_bodyid] != 0)
+    chosen = moving if np.any(moving) else sized
+    poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, 60).astype(int))]
+    places = np.empty((len(poses), int(chosen.sum()), 3))
+    for place, pose in zip(places, poses, strict=True):
+        _pose(model, data, pose)
+        place[:] = data.geom_xpos[chosen]
+    view = mujoco.MjvCamera()
+    view.type = mujoco.mjtCamera.mjCAMERA_FREE
+    view.azimuth, view.elevation = 110.0, -12.0
+    radius = float(model.stat.extent)
+    view.lookat[:] = model.stat.center
+    if places.size:
+        bound = model.geom_rbound[chosen][:, None]
+        center = ((places - bound).min(axis=(0, 1)) + (places + bound).max(axis=(0, 1))) / 2.0
+        radius = float((np.linalg.norm(places - center, axis=-1) + bound[:, 0]).max())
+        view.lookat[:] = center
+    half_angle = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * min(1.0, aspect))
+    view.distance = 1.05 * radius / np.sin(half_angle)
+    return view
+
+
+# Text
+
+
+def _write(frame: Frame, lines: Sequence[str], time: float) -> Frame:
+    """The frame with lines of text in a translucent box at its top left."""
+    if not lines:
+        return frame
+    from PIL import Image, ImageDraw
+
+    height, width = frame.shape[:2]
+    template = "\n".join(lines)
+    font = _fitted_font(template.replace("{time}", "00.00 s"), height, width)
+    text = template.replace("{time}", f"{time:.2f} s")
+    image = Image.fromarray(frame)
+    draw = ImageDraw.Draw(image, "RGBA")
+    margin = height // 40
+    corner = (2 * margin, 2 * margin)
+    left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
+    box = (left - margin, top - margin, right + margin, bottom + margin)
+    draw.rounded_rectangle(box, radius=margin // 2, fill=(14, 18, 25, 165))
+    draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
+    return np.asarray(image)
+
+
+@lru_cache(maxsize=16)
+def _fitted_font(text: str, height: int, width: int) -> ImageFont.FreeTypeFont:
+    """The largest font, up to 1/28 of the height, with which the text fits the frame."""
+    from PIL import Image, ImageDraw
+
+    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    margin = height // 40
+    for size in range(max(9, height // 28), 8, -1):
+        font = _font(size)
+        box = draw.multiline_textbbox((0, 0), text, font, spacing=margin // 2)
+        if box[2] <= width - 4 * margin and box[3] <= height - 4 * margin:
+            break
+    return font
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans (it has mathematical signs), which matplotlib brings; else Pillow's own."""
+    from PIL import ImageFont
+
+    found = importlib.util.find_spec("matplotlib")  # located, not imported: that takes a second
+    if found is not None and found.origin is not None:
+        path = Path(found.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"
+        if path.exists():
+            return ImageFont.truetype(str(path), size)
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont)
+    return font
+
+
+# OpenGL
+
+
+@contextlib.contextmanager
+def _drawer(model: mujoco.MjModel, height: int, width: int) -> Iterator[Drawer]:
+    """OpenGL if this machine has it, else the painter."""
+    context = _gl_context()
+    if context is None:
+        from mjx_drax.painter import Painter
+
+        yield Painter(model, height, width)
+        return
+    drawer = _GlDrawer(context, model, height, width)
+    try:
+        yield drawer
+    finally:
+        drawer.close()
+
+
+class _GlDrawer:
+    """An offscreen OpenGL buffer of any size; `mujoco.Renderer` picks its platform at import."""
+
+    def __init__(
+        self, context: Callable[[int, int], Any], model: mujoco.MjModel, height: int, width: int
+    ) -> None:
+        self._gl = context(width, height)
+        self._gl.make_current()
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._cheap = _is_software()
+        samples = int(model.vis.quality.offsamples)
+        try:
+            if self._cheap:  # multisampling doubles a frame's time on a CPU
+                model.vis.quality.offsamples = 0
+            self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        finally:
+            model.vis.quality.offsamples = samples
+        mujoco.mjr_resizeOffscreen(width, height, self._mjr)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+
+    def render(self, scene: mujoco.MjvScene) -> Frame:
+        self._gl.make_current()  # another drawer may have been in between
+        if self._cheap:
+            scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+            scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        frame = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_render(self._rect, scene, self._mjr)
+        mujoco.mjr_readPixels(frame, None, self._rect, self._mjr)
+        return frame[::-1]  # OpenGL counts rows from below
+
+    def close(self) -> None:
+        self._gl.make_current()
+        self._mjr.free()
+        self._gl.free()
+
+
+def _is_software() -> bool:
+    """Whether the current OpenGL context draws on the CPU."""
+    from OpenGL import GL
+
+    name = GL.glGetString(GL.GL_RENDERER) or b""
+    return any(word in name.lower() for word in (b"llvmpipe", b"softpipe", b"swrast"))
+
+
+@lru_cache(maxsize=1)
+def _gl_context() -> Callable[[int, int], Any] | None:
+    """The first kind of OpenGL context that works here; None, with one warning, if none does."""
+    failures = []
+    for platform_name in _gl_platforms():
+        try:
+            return _tried_context(platform_name)
+        except Exception as error:  # missing libraries raise whatever the bindings tripped over
+            failures.append(f"{platform_name}: {error}")
+    reason = "; ".join(failures) or f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}"
+    warnings.warn(
+        f"no OpenGL ({reason}): frames are drawn by a simple painter. On Debian or Ubuntu, "
+        f"`{APT_EGL}` gives better ones.",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+def _gl_platforms() -> tuple[str, ...]:
+    wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if wanted in _GL_OFF:
+        return ()
+    if wanted in ("egl", "osmesa"):
+        return (wanted,)
+    return {"Darwin": ("cgl",), "Windows": ("glfw",)}.get(platform.system(), ("egl", "osmesa"))
+
+
+def _tried_context(platform_name: str) -> Callable[[int, int], Any]:
+    """A kind of context, once one has been made and used; a failure leaves nothing behind."""
+    modules = set(sys.modules)
+    variable = os.environ.get("PYOPENGL_PLATFORM")
+    try:
+        context = importlib.import_module(f"mujoco.{platform_name}").GLContext
+        _GlDrawer(context, mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
+    except Exception:
+        # PyOpenGL settles on a platform when it is imported: forget it, for the next attempt.
+        for name in set(sys.modules) - modules:
+            if name.split(".")[0] == "OpenGL" or name.startswith(f"mujoco.{platform_name}"):
+                del sys.modules[name]
+        raise
+    finally:  # mujoco's module sets the variable and does not need it any more
+        os.environ.pop("PYOPENGL_PLATFORM", None)
+        if variable is not None:
+            os.environ["PYOPENGL_PLATFORM"] = variable
+    return context

@@ -1,0 +1,47 @@
+"""How the noise, penalty, damping and barrier weights change over a solve.
+
+A schedule is a function of progress t: 0 to 1 while noise is on, 1 to 2 in the noise-free tail.
+Its numbers are traced, so they may change without recompiling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jax import Array
+from jax.tree_util import register_dataclass
+from jax.typing import ArrayLike
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Constant:
+    """The same value all along."""
+
+    value: ArrayLike
+
+    def __call__(self, t: Array) -> Array:
+        """The value at progress t."""
+        return jnp.asarray(self.value)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Geometric:
+    """start (end / start)^t while noise is on; then on to `final` over the tail's first half.
+
+    Without `final` the tail holds `end`.
+    """
+
+    start: ArrayLike
+    end: ArrayLike
+    final: ArrayLike | None = None
+
+    def __call__(self, t: Array) -> Array:
+        """The value at progress t in [0, 2]."""
+        start, end = jnp.asarray(self.start), jnp.asarray(self.end)
+        value = start * (end / start) ** jnp.minimum(t, 1.0)
+        if self.final is None:
+            return value
+        return value * (self.final / end) ** jnp.clip(2.0 * (t - 1.0), 0.0, 1.0)

@@ -1,0 +1,354 @@
+"""Solve a problem, and certify the answer by replaying it.
+
+A cost alone says nothing, because an infeasible trajectory undercuts the optimum. So every chain's
+controls are replayed from x_init by an engine that knows nothing of the solve (MuJoCo's C engine
+for MJCF, a float64 rollout for functions), open loop and with the feedback
+
+    u_k + K_k (x_k - x_k^plan),   clipped to the control bounds,
+
+where K is the time-varying LQR that the solver's factorization yields. Success means that the
+replay reaches the goal; without a goal, that it ends within `TRACKED` of the plan.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax.errors import DraxError
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, State, advance, evaluate
+from mjx_drax.precondition import Identity, feedback_gains
+from mjx_drax.problem import Problem, Trajectory, checked
+
+TRACKED = 1e-2
+"""Largest final deviation |x - plan| of a successful replay, where the problem has no goal."""
+
+CHUNK = 10
+"""Iterations between two reports, records of the history, and chances to interrupt."""
+
+CONVERGED, INFEASIBLE, DIVERGED = "converged", "infeasible", "diverged"
+
+Progress = Callable[[int, int, Info], None]
+
+
+@dataclass(frozen=True)
+class Replays:
+    """What the engine did with every chain's controls.
+
+    states (chains, K+1, nx), controls (chains, K, nu), largest deviation from the plan over the
+    whole motion and at its end, cost, and whether it succeeded, (chains,) each.
+    """
+
+    states: np.ndarray
+    controls: np.ndarray
+    max_deviation: np.ndarray
+    final_deviation: np.ndarray
+    cost: np.ndarray
+    success: np.ndarray
+
+    def summary(self, chain: int) -> dict[str, Any]:
+        """One chain's numbers."""
+        return {
+            "max_deviation": float(self.max_deviation[chain]),
+            "final_deviation": float(self.final_deviation[chain]),
+            "cost": float(self.cost[chain]),
+            "success": bool(self.success[chain]),
+        }
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What happened when the best chain was replayed, open loop and with feedback."""
+
+    engine: str
+    open_loop: dict[str, Any]
+    feedback: dict[str, Any]
+
+    @property
+    def success(self) -> bool:
+        """Whether one of the two replays reached the goal."""
+        return bool(self.open_loop["success"] or self.feedback["success"])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """All chains of a solve, what they reached, and how the answer replays. Arrays are numpy's.
+
+    Attributes:
+        problem: what was solved.
+        solver: with which settings.
+        seed: of the random keys.
+        trajectories: (chains, K, nx) and (chains, K, nu).
+        multipliers: lambda, (chains, K, ndx).
+        gains: feedback K_k, (chains, K, nu, ndx).
+        cost, max_defect, max_violation: of every chain, (chains,).
+        converged_at: iteration since which max|h| < 1e-3, else -1, (chains,).
+        died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
+        open_loop, feedback: the replays of every chain.
+        history: `iteration` (records,), and `cost`, `max_defect` (records, chains).
+        iterations: how many were done.
+        compile_time, solve_time: [s].
+    """
+
+    problem: Problem
+    solver: Langevin
+    seed: int
+    trajectories: Trajectory
+    multipliers: np.ndarray
+    gains: np.ndarray
+    cost: np.ndarray
+    max_defect: np.ndarray
+    max_violation: np.ndarray
+    converged_at: np.ndarray
+    died_at: np.ndarray
+    open_loop: Replays
+    feedback: Replays
+    history: dict[str, np.ndarray]
+    iterations: int
+    compile_time: float
+    solve_time: float
+
+    @property
+    def chains(self) -> int:
+        """Number of chains."""
+        return len(self.cost)
+
+    @cached_property
+    def feasible(self) -> np.ndarray:
+        """Whether max|h| < 1e-3, (chains,)."""
+        return (self.max_defect < FEASIBLE) & (self.died_at < 0)
+
+    @cached_property
+    def success(self) -> np.ndarray:
+        """Whether a chain is feasible and its replay with feedback reaches the goal, (chains,)."""
+        return self.feasible & self.feedback.success
+
+    @property
+    def success_rate(self) -> float:
+        """Share of chains that succeed."""
+        return float(self.success.mean())
+
+    @cached_property
+    def status(self) -> list[str]:
+        """`converged`, `infeasible` or `diverged`, for every chain."""
+        names = np.where(self.feasible, CONVERGED, INFEASIBLE)
+        return list(np.where(self.died_at >= 0, DIVERGED, names))
+
+    @cached_property
+    def best_chain(self) -> int:
+        """The cheapest chain that succeeds; else that is feasible; else the least infeasible."""
+        for eligible in (self.feasible & (self.success | self.open_loop.success), self.feasible):
+            if eligible.any():
+                return int(np.argmin(np.where(eligible, self.cost, np.inf)))
+        return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
+
+    @property
+    def best(self) -> Trajectory:
+        """The best chain's knots x_1..x_K (K, nx) and u_0..u_{K-1} (K, nu)."""
+        return jax.tree.map(lambda a: a[self.best_chain], self.trajectories)
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """How the best chain replays."""
+        return Certificate(
+            self.problem.dynamics.engine,
+            self.open_loop.summary(self.best_chain),
+            self.feedback.summary(self.best_chain),
+        )
+
+    @property
+    def certified(self) -> bool:
+        """Whether the best chain is feasible and a replay of it succeeds."""
+        return bool(self.feasible[self.best_chain]) and self.certificate.success
+
+    @property
+    def replayed(self) -> tuple[np.ndarray, np.ndarray]:
+        """States (K+1, nx) and controls (K, nu) of the best chain as replayed.
+
+        Open loop where that succeeds, with feedback otherwise.
+        """
+        chain = self.best_chain
+        replays = self.open_loop if self.open_loop.success[chain] else self.feedback
+        return replays.states[chain], replays.controls[chain]
+
+
+def solve(
+    problem: Problem,
+    chains: int = 64,
+    seed: int = 0,
+    solver: Langevin | None = None,
+    guess: Trajectory | None = None,
+    progress: Progress | None = None,
+) -> Solution:
+    """Run `chains` Langevin chains and replay what they found.
+
+    Args:
+        problem: from `from_mjcf` or `from_function`.
+        chains: number of chains.
+        seed: of all random numbers.
+        solver: settings; `Langevin()` by default.
+        guess: initial knots instead of random ones: one trajectory for all chains, (K, nx) and
+            (K, nu), or one each, (chains, K, nx) and (chains, K, nu). They need not be feasible.
+        progress: called with (iterations done, of how many, diagnostics) every few iterations;
+            Ctrl-C between two calls ends the solve early and keeps what there is.
+
+    Returns:
+        the solution with its certificate; look at `solution.certified`.
+
+    Raises:
+        DraxError: sizes that misfit, or a cost or dynamics that are not finite at any initial knot.
+    """
+    if chains < 1:
+        raise DraxError(f"chains is {chains}: give at least 1.")
+    problem = checked(problem)
+    solver = solver or Langevin()
+    total = int(solver.iterations) + int(solver.tail)
+    if total < 1:
+        raise DraxError(f"iterations + tail is {total}: give at least 1.")
+    key_knots, key_noise = jax.random.split(jax.random.key(seed))
+    state = solver.init(problem, _initial_knots(problem, chains, guess, key_knots), key_noise)
+
+    clock = time.perf_counter()
+    info = jax.block_until_ready(evaluate(problem, state.trajectory))
+    _require_finite(problem, info)
+    jax.block_until_ready(advance(solver, problem, state, 0, 0))
+    compile_time = time.perf_counter() - clock
+
+    clock = time.perf_counter()
+    records = [(0, info)]
+    done, converged_at = 0, np.full(chains, -1)
+    try:
+        while done < total:
+            stop = min(done + CHUNK, total)
+            state = advance(solver, problem, state, done, stop)
+            info = jax.block_until_ready(evaluate(problem, state.trajectory))
+            done = stop
+            records.append((done, info))
+            feasible = np.asarray(info.max_defect) < FEASIBLE
+            converged_at = np.where(feasible & (converged_at < 0), done, converged_at)
+            converged_at = np.where(feasible, converged_at, -1)
+            if progress is not None:
+                progress(done, total, info)
+    except KeyboardInterrupt:
+        pass  # the chains as they were at the last report
+    solve_time = time.perf_counter() - clock
+    return _certified(problem, solver, seed, state, records, converged_at, compile_time, solve_time)
+
+
+def _initial_knots(
+    problem: Problem, chains: int, guess: Trajectory | None, key: Array
+) -> Trajectory:
+    """Initial knots for every chain: drawn, or the guess broadcast to all of them."""
+    if guess is None:
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
+        return jax.vmap(problem.draw)(keys)
+    K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
+    knots = []
+    for label, value, size in (("x", guess.x, nx), ("u", guess.u, nu)):
+        array = np.asarray(value, problem.x_init.dtype)
+        if array.shape not in ((K, size), (chains, K, size)):
+            raise DraxError(
+                f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
+                f"({chains}, {K}, {size}) with one for each chain."
+            )
+        if not np.isfinite(array).all():
+            raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
+        knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
+    return Trajectory(*knots)
+
+
+def _require_finite(problem: Problem, info: Info) -> None:
+    """Complain if no chain could possibly start."""
+    for label, values in (("cost", info.cost), ("dynamics", info.max_defect)):
+        if not np.isfinite(values).any():
+            raise DraxError(
+                f"the {label} of {problem.name} is {float(values[0])} at the initial knots of "
+                f"every chain ({len(values)} tried): make it finite there (no 0/0, no log or sqrt "
+                "of negative numbers), or narrow the scatter of the initial knots."
+            )
+
+
+def _certified(
+    problem: Problem,
+    solver: Langevin,
+    seed: int,
+    state: State,
+    records: list[tuple[int, Info]],
+    converged_at: np.ndarray,
+    compile_time: float,
+    solve_time: float,
+) -> Solution:
+    """The solution: everything on the host, every chain replayed twice."""
+    trajectories = jax.tree.map(np.asarray, state.trajectory)
+    gains = np.asarray(state.gains)
+    if isinstance(solver.preconditioner, Identity):  # it factorizes nothing: there are no gains yet
+        gains = np.asarray(
+            feedback_gains(problem, solver.barrier, state.trajectory, solver.levels(2))
+        )
+    info = records[-1][1]
+    return Solution(
+        problem=problem,
+        solver=solver,
+        seed=seed,
+        trajectories=trajectories,
+        multipliers=np.asarray(state.multipliers),
+        gains=gains,
+        cost=np.asarray(info.cost),
+        max_defect=np.asarray(info.max_defect),
+        max_violation=np.asarray(info.max_violation),
+        converged_at=converged_at,
+        died_at=np.asarray(state.died_at),
+        open_loop=_replays(problem, trajectories, np.zeros_like(gains)),
+        feedback=_replays(problem, trajectories, gains),
+        history={
+            "iteration": np.array([done for done, _ in records]),
+            "cost": np.stack([np.asarray(i.cost) for _, i in records]),
+            "max_defect": np.stack([np.asarray(i.max_defect) for _, i in records]),
+        },
+        iterations=records[-1][0],
+        compile_time=compile_time,
+        solve_time=solve_time,
+    )
+
+
+def _replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> Replays:
+    """Replay every chain's controls with the given gains, and judge where they end."""
+    dynamics, bounds = problem.dynamics, problem.bounds
+    chains = len(gains)
+    start = np.broadcast_to(problem.x_init, (chains, 1, dynamics.nx))
+    plan = np.concatenate([start, trajectories.x], axis=1).astype(float)
+    states, controls = dynamics.replay(
+        plan,
+        trajectories.u.astype(float),
+        gains.astype(float),
+        (np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)),
+    )
+    off = np.abs(dynamics.difference(states, plan)).max(axis=-1)
+    off = np.nan_to_num(off, nan=np.inf)
+    dtype = trajectories.x.dtype
+    costs = evaluate(problem, Trajectory(states[:, 1:].astype(dtype), controls.astype(dtype))).cost
+    reached = [_reached(problem, states[c, -1], off[c, -1]) for c in range(chains)]
+    return Replays(
+        states=states,
+        controls=controls,
+        max_deviation=off.max(axis=1),
+        final_deviation=off[:, -1],
+        cost=np.asarray(costs),
+        success=np.array(reached),
+    )
+
+
+def _reached(problem: Problem, x: np.ndarray, deviation: float) -> bool:
+    """Whether a replay that ends at x (nx,), off its plan by `deviation`, is a success."""
+    if not np.isfinite(x).all():
+        return False
+    reached = problem.reached(x)
+    return bool(deviation < TRACKED) if reached is None else reached

@@ -1,0 +1,273 @@
+"""Frames and videos, with OpenGL where the machine has it and with the painter everywhere."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import rendering
+from mjx_drax.errors import DraxError
+
+ROOT = Path(__file__).resolve().parents[1]
+HEIGHT, WIDTH = 120, 160
+
+
+def _model(name: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(ROOT / "models" / f"{name}.xml"))
+
+
+def _has_opengl() -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return rendering._gl_context() is not None
+
+
+def _amber(frame: np.ndarray) -> np.ndarray:
+    """Where (height, width) the pixels have the color of the moving links' ends."""
+    red, green, blue = (frame[..., i].astype(int) for i in range(3))
+    return (red > 90) & (red > green + 25) & (green > blue + 10)
+
+
+@pytest.fixture(autouse=True)
+def _fresh_choice() -> Iterator[None]:
+    rendering._gl_context.cache_clear()
+    yield
+    rendering._gl_context.cache_clear()
+
+
+@pytest.fixture(params=["opengl", "painter"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "painter":
+        monkeypatch.setattr(rendering, "_gl_context", lambda: None)
+    elif not _has_opengl():
+        pytest.skip("no OpenGL on this machine")
+    return str(request.param)
+
+
+def test_frames_have_the_asked_shape(backend: str) -> None:
+    frames = rendering.render_frames(
+        _model("pendulum"), [[0.0], [1.0]], [0.0, 0.5], fps=10, size=(HEIGHT, WIDTH)
+    )
+    assert frames.shape == (6 + 5, HEIGHT, WIDTH, 3)  # six instants, then half a second held
+    assert frames.dtype == np.uint8
+    assert np.any(frames[0] != frames[5])
+    for held in frames[6:]:
+        np.testing.assert_array_equal(held, frames[5])
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "up"),
+    [
+        ("pendulum", [np.pi / 2], [np.pi]),
+        ("acrobot", [np.pi / 2, 0.0], [np.pi, 0.0]),
+        ("cartpole", [0.0, np.pi / 2], [0.0, np.pi]),
+    ],
+)
+def test_the_robot_is_where_its_angle_says(
+    name: str, right: list[float], up: list[float], backend: str
+) -> None:
+    down = [0.0] * len(up)
+    poses = np.array([down, right, up, [-angle for angle in right]])
+    frames = rendering.render_frames(_model(name), poses, range(4), fps=1, size=(HEIGHT, WIDTH))
+    middles = [np.argwhere(_amber(frame)).mean(axis=0) for frame in frames[:4]]
+    (down_y, down_x), (right_y, right_x), (up_y, up_x), (_, left_x) = middles
+    assert left_x + 5 < down_x < right_x - 5
+    assert up_y + 5 < right_y < down_y - 5
+    assert abs(up_x - down_x) < 3
+
+
+@pytest.mark.parametrize(
+    ("name", "poses"),
+    [
+        ("pendulum", [[angle] for angle in np.linspace(-np.pi, np.pi, 9)]),
+        ("acrobot", [[angle, 0.0] for angle in np.linspace(-np.pi, np.pi, 9)]),
+        ("cartpole", [[x, a] for x in (-1.8, 1.8) for a in (0.0, np.pi / 2, np.pi, -np.pi / 2)]),
+    ],
+)
+def test_the_main_camera_sees_every_pose(name: str, poses: list[list[float]], backend: str) -> None:
+    frames = rendering.render_frames(
+        _model(name), poses, range(len(poses)), fps=1, size=(HEIGHT, WIDTH)
+    )
+    for frame in frames:
+        seen = _amber(frame)
+        assert np.any(seen)
+        border = np.concatenate([seen[0], seen[-1], seen[:, 0], seen[:, -1]])
+        assert not np.any(border)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "acrobot", "cartpole"])
+def test_painter_agrees_with_opengl(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not _has_opengl():
+        pytest.skip("no OpenGL on this machine")
+    model = _model(name)
+    poses = np.linspace(0.0, 2.5, 4)[:, None] * np.ones(model.nq)
+    poses[:, 0] = np.minimum(poses[:, 0], 1.8) if name == "cartpole" else poses[:, 0]
+    opengl = rendering.render_frames(model, poses, range(4), fps=1)
+    monkeypatch.setattr(rendering, "_gl_context", lambda: None)
+    painted = rendering.render_frames(model, poses, range(4), fps=1)
+    for one, other in zip(_amber(opengl), _amber(painted), strict=True):
+        assert np.sum(one & other) > 0.7 * np.sum(one | other)
+    assert np.abs(opengl.astype(int) - painted).mean() < 20
+
+
+def test_video_is_one_that_browsers_play(tmp_path: Path, backend: str) -> None:
+    import imageio_ffmpeg
+
+    path = tmp_path / "new" / "swing.mp4"
+    written = rendering.render_motion(
+        _model("pendulum"),
+        [[0.0], [2.0]],
+        [0.0, 1.0],
+        path,
+        overlay=("max|h| 1e-6", "{time}"),
+        fps=20,
+        size=(HEIGHT - 1, WIDTH - 1),
+    )
+    assert written == path
+    assert [item.name for item in path.parent.iterdir()] == ["swing.mp4"]
+    # mediapy.read_video passes -vsync, which the ffmpeg of imageio-ffmpeg no longer knows.
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(path)]
+    pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    decoded = subprocess.run([*command, *pixels], capture_output=True, check=True).stdout
+    assert len(decoded) == (21 + 10) * HEIGHT * WIDTH * 3
+    probe = subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    assert "h264" in probe
+    assert "yuv420p" in probe
+    content = path.read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")  # the index first: plays at once
+
+
+def test_overlay_is_drawn_and_tells_the_time(backend: str) -> None:
+    model, poses, times = _model("pendulum"), [[0.0], [0.0]], [0.0, 1.0]
+    plain = rendering.render_frames(model, poses, times, fps=2)
+    lines = rendering.render_frames(model, poses, times, fps=2, overlay=("cost 1.0", "t = {time}"))
+    changed = np.argwhere(np.any(plain[0] != lines[0], axis=-1))
+    assert len(changed) > 1000
+    assert changed.max(axis=0)[0] < plain.shape[1] // 3
+    assert np.any(lines[0] != lines[1])
+    np.testing.assert_array_equal(plain[0], plain[1])
+
+
+def test_wide_overlay_shrinks_to_fit(backend: str) -> None:
+    lines = ("replayed in MuJoCo C: max|h| 1.0e-06, bound violation 0, reaches the goal",)
+    frames = rendering.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2, overlay=lines)
+    plain = rendering.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2)
+    assert not np.any((frames != plain)[:, :, -8:])
+
+
+def test_a_model_without_cameras_is_framed(backend: str) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><light pos="0 0 9"/><geom type="plane" size="0 0 1"/>
+        <body pos="0 0 5"><freejoint/><geom type="box" size=".3 .2 .1" rgba=".9 .5 .1 1"/></body>
+        </worldbody></mujoco>"""
+    )
+    poses = [[0.0, 0, 5, 1, 0, 0, 0], [3.0, 0, 6, 0, 1, 0, 0]]
+    for frame in rendering.render_frames(model, poses, [0.0, 1.0], fps=4, size=(HEIGHT, WIDTH)):
+        seen = np.argwhere(_amber(frame))
+        assert len(seen) > 20
+        assert np.all(seen.min(axis=0) > 0)
+        assert np.all(seen.max(axis=0) < (HEIGHT - 1, WIDTH - 1))
+
+
+def test_interpolation_follows_geodesics() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint type="ball"/><geom size="1"/></body></worldbody>
+        </mujoco>"""
+    )
+    quarter = np.array([np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)])
+    poses, times = np.array([[1.0, 0.0, 0.0, 0.0], quarter]), np.array([0.0, 2.0])
+    middle = rendering._interpolate(model, poses, times, 1.0)
+    np.testing.assert_allclose(middle, [np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)], atol=1e-12)
+    np.testing.assert_array_equal(rendering._interpolate(model, poses, times, 2.0), quarter)
+
+
+def test_bad_input_is_refused_before_drawing(tmp_path: Path) -> None:
+    model = _model("pendulum")
+    good = ([[0.0], [1.0]], [0.0, 1.0])
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(DraxError, match=r"no camera 'side'.*main"):
+        rendering.render_frames(model, *good, camera="side")
+    with pytest.raises(DraxError, match=r"no camera 3.*main"):
+        rendering.render_frames(model, *good, camera=3)
+    with pytest.raises(DraxError, match=r"\(T, 1\)"):
+        rendering.render_frames(model, [[0.0, 0.0]], [0.0])
+    with pytest.raises(DraxError, match=r"times must have the shape"):
+        rendering.render_frames(model, good[0], [0.0])
+    with pytest.raises(DraxError, match=r"must not decrease"):
+        rendering.render_frames(model, good[0], [1.0, 0.0])
+    with pytest.raises(DraxError, match=r"finite; row 1"):
+        rendering.render_frames(model, [[0.0], [np.nan]], good[1])
+    with pytest.raises(DraxError, match=r"fps"):
+        rendering.render_frames(model, *good, fps=0)
+    with pytest.raises(DraxError, match=r"size"):
+        rendering.render_frames(model, *good, size=(0, 640))
+    with pytest.raises(DraxError, match=r"\.mp4"):
+        rendering.render_motion(model, *good, tmp_path / "video.gif")
+    with pytest.raises(DraxError, match=r"cannot write"):
+        rendering.render_motion(model, *good, file / "video.mp4")
+    assert [item.name for item in tmp_path.iterdir()] == ["file"]
+
+
+def test_without_opengl_one_warning_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise ImportError(f"no {name}")
+
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(rendering, "_tried_context", fail)
+    motion = (_model("pendulum"), [[0.0]], [0.0])
+    with pytest.warns(RuntimeWarning, match="apt-get install.*libegl1") as caught:
+        twice = [rendering.render_frames(*motion, fps=2, size=(HEIGHT, WIDTH)) for _ in range(2)]
+    assert len(caught) == 1
+    assert twice[0].shape == (2, HEIGHT, WIDTH, 3)
+
+
+def _run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    dropped = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")
+    environment = {k: v for k, v in os.environ.items() if k not in dropped}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment.get("PYTHONPATH", "")])
+    command = [sys.executable, "-c", code]
+    environment |= variables
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_importing_changes_nothing() -> None:
+    result = _run(
+        "import os, sys; before = dict(os.environ)\n"
+        "import mjx_drax.rendering\n"
+        "assert dict(os.environ) == before\n"
+        "assert not {'OpenGL', 'mujoco.egl', 'mediapy', 'PIL'} & set(sys.modules)\n"
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_drawing_leaves_the_environment_alone() -> None:
+    result = _run(
+        "import os; before = dict(os.environ)\n"
+        "import mujoco\nfrom mjx_drax import rendering\n"
+        f"model = mujoco.MjModel.from_xml_path({str(ROOT / 'models' / 'pendulum.xml')!r})\n"
+        "rendering.render_frames(model, [[0.0]], [0.0], fps=2, size=(48, 64))\n"
+        "assert dict(os.environ) == before\n"
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_missing_libraries_of_a_chosen_backend_are_named(tmp_path: Path) -> None:
+    # With MUJOCO_GL=egl and no libEGL, `import mujoco` fails as this stand-in does.
+    complaint = "'NoneType' object has no attribute 'eglQueryString'"
+    (tmp_path / "mujoco.py").write_text(f"raise AttributeError({complaint!r})")
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import mjx_drax.rendering"
+    result = _run(code, MUJOCO_GL="egl")
+    assert result.returncode != 0
+    last = result.stderr.splitlines()[-1]
+    assert "MUJOCO_GL=egl is set" in last
+    assert "unset MUJOCO_GL" in last
+    assert "libegl1" in last
