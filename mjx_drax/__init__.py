@@ -48,7 +48,7 @@ _HOME = {
     "solve": "solution",
 }
 
-__all__ = sorted(_HOME)  # noqa: PLE0604
+__all__ = sorted(_HOME)
 
 if not (Path(__file__).parent / "tasks").is_dir():  # a checkout: tasks and models lie beside us
     __path__.append(str(Path(__file__).parents[1]))

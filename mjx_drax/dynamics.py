@@ -77,6 +77,10 @@ class Dynamics:
         """
         raise NotImplementedError
 
+    def deviation(self, states: np.ndarray, plan: np.ndarray) -> np.ndarray:
+        """max|x - plan| in tangent space, (...,) for states and plan of shape (..., nx)."""
+        return np.abs(states - plan).max(axis=-1)
+
     def observe_replayed(self, x: np.ndarray) -> Any:
         """What goal functions receive for a replayed state (nx,): here the state itself."""
         return x

@@ -2,8 +2,8 @@
 
 One iteration of a chain (Kurtz and Burdick, with the metric M of `precondition`):
 
-    X      <- X + alpha d + sigma sqrt(2 alpha) n,     d = -M^{-1} grad L_mu(X, lambda),  n ~ N(0, M^{-1})
-    lambda <- lambda + alpha r,                        r = mu (h + J d)
+    X      <- X + alpha d + sigma sqrt(2 alpha) n,    d = -M^{-1} grad L_mu,  n ~ N(0, M^{-1})
+    lambda <- lambda + alpha r,                       r = mu (h + J d)
 
 While sigma > 0 knots leave the dynamics and wander between basins; the multipliers pull them back
 onto h = 0 as sigma falls. The noise-free tail then takes the step size that lowers the augmented
@@ -91,8 +91,8 @@ class Langevin:
         barrier: how bounds are kept.
     """
 
-    iterations: ArrayLike = 100
-    tail: ArrayLike = 50
+    iterations: int = 100
+    tail: int = 50
     step_size: ArrayLike = 0.3
     noise: Geometric | Constant = Geometric(0.3, 0.01)
     penalty: Geometric | Constant = Geometric(100.0, 1000.0)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.tree_util import register_dataclass
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from mjx_drax._mujoco import mujoco
 from mjx_drax.dynamics import Dynamics, Static
@@ -50,7 +50,7 @@ class HostModel:
 @register_dataclass
 @dataclass(frozen=True)
 class MjxDynamics(Dynamics):
-    """f(x, u) = `substeps` steps of MJX under constant control, x = [qpos (nq), qvel (nv), act (na)].
+    """`substeps` steps of MJX under constant control; x = [qpos (nq), qvel (nv), act (na)].
 
     Attributes:
         model: the model on the device; its numbers (masses, gears, ...) are traced.
@@ -211,7 +211,7 @@ def from_mjcf(
         terminal_residual: r(data) (n,): adds 1/2 |r|^2 to the terminal cost.
         dt: control step [s], a multiple of the model's timestep; by default the multiple that comes
             closest to 0.02 s.
-        x_init: x_0 = [qpos, qvel, act]; by default the model's first keyframe, else its default pose.
+        x_init: x_0 = [qpos, qvel, act]; by default the first keyframe, else the default pose.
         x_bounds: (lower, upper) on states, each broadcastable to (nx,).
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
@@ -323,11 +323,14 @@ def _on_device(model: mujoco.MjModel) -> mjx.Model:
     flags = model.opt.disableflags
     try:
         model.opt.disableflags = flags | mujoco.mjtDisableBit.mjDSBL_LIMIT
-        return mjx.put_model(model, impl="jax")
+        on_device = mjx.put_model(model, impl="jax")
     except (NotImplementedError, ValueError) as error:
         raise DraxError(f"MJX does not support this model: {error}") from error
     finally:
         model.opt.disableflags = flags
+    # MJX commits its arrays to a device. What is computed from them is then committed as well, and
+    # a loop that is fed its own output would be compiled a second time.
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device)
 
 
 def _refuse_unsupported(model: mujoco.MjModel, name: str) -> None:

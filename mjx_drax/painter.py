@@ -20,6 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from mjx_drax._mujoco import mujoco
+
 Floats = npt.NDArray[np.floating[Any]]
 Frame = npt.NDArray[np.uint8]
 

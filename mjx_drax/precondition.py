@@ -37,8 +37,13 @@ class Levels:
 @register_dataclass
 @dataclass(frozen=True)
 class Direction:
-    """Drift d and unit noise n, in tangent space, the multipliers' rate r (K, ndx), and the
-    feedback gains (K, nu, ndx) that come with the metric (zeros if none do).
+    """One step's ingredients, in tangent space.
+
+    Attributes:
+        drift: d.
+        noise: n, for sigma = 1.
+        multipliers: their rate r, (K, ndx).
+        gains: feedback that comes with the metric, (K, nu, ndx); zeros if none does.
     """
 
     drift: Trajectory

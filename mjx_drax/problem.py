@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.tree_util import Partial, register_dataclass
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
 from mjx_drax.errors import DraxError
@@ -36,7 +36,7 @@ class Trajectory:
 @register_dataclass
 @dataclass(frozen=True)
 class Box:
-    """Lower and upper ends of states (nx,) or (K, nx) and controls (nu,) or (K, nu); +-inf is free."""
+    """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free."""
 
     x_lower: Array
     x_upper: Array
@@ -123,8 +123,10 @@ def _positive_part(matrix: Array) -> Array:
 @register_dataclass
 @dataclass(frozen=True)
 class Problem:
-    """An optimal control problem. A pytree: functions, sizes and the horizon are static, every
-    number (x_init, bounds, model parameters, bound arguments of the costs) is traced.
+    """An optimal control problem, as a pytree.
+
+    Functions, sizes and the horizon are static; every number (x_init, bounds, model parameters,
+    bound arguments of the costs) is traced.
 
     Attributes:
         dynamics: x_{k+1} = f(x_k, u_k).
@@ -163,9 +165,15 @@ class Problem:
         """phi(x), scalar."""
         return self.terminal(self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)))
 
+    def with_start(self, trajectory: Trajectory) -> Array:
+        """x_0..x_K, (..., K + 1, nx): the states with x_init in front."""
+        x = jnp.asarray(trajectory.x)
+        start = jnp.broadcast_to(self.x_init, (*x.shape[:-2], 1, x.shape[-1]))
+        return jnp.concatenate([start, x], axis=-2)
+
     def stages(self, trajectory: Trajectory) -> Array:
         """x_0..x_{K-1} (K, nx): the states that the controls act on."""
-        return jnp.concatenate([self.x_init[None], trajectory.x[:-1]])
+        return self.with_start(trajectory)[:-1]
 
     def cost(self, trajectory: Trajectory) -> Array:
         """phi(x_K) + sum_k l(x_k, u_k), scalar."""
@@ -229,7 +237,7 @@ def knots(horizon: float, dt: float) -> int:
     count = round(horizon / dt)
     if count < 1:
         raise DraxError(
-            f"horizon is {horizon} s, shorter than one control step of {dt} s: give at least {dt} s."
+            f"horizon is {horizon} s, shorter than one control step: give at least {dt} s."
         )
     return count
 

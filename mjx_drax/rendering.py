@@ -1,4 +1,7 @@
-"""Videos of a motion without a display: OpenGL through EGL or OSMesa, else the numpy painter.
+"""Films of solutions and motions without a display.
+
+Models are drawn with OpenGL through EGL or OSMesa, else by the numpy painter; problems without a
+model by a function that the task brings, on matplotlib axes.
 
 Importing this module touches neither OpenGL nor the environment. The first frame ever drawn
 decides how frames are drawn from then on: EGL (hardware, or Mesa's llvmpipe), then OSMesa, then
@@ -15,7 +18,7 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -27,12 +30,17 @@ from mjx_drax._mujoco import APT_EGL, mujoco
 from mjx_drax.errors import DraxError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from PIL import ImageFont
+
+    from mjx_drax.solution import Solution
 
 Frame = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.floating[Any]]
 
 _HOLD = 0.5  # [s] the last frame stays this long
+_DRAWN_INCHES = 5.0  # height of a drawn frame: sets the size of its letters
+_UNCERTIFIED = "NOT CERTIFIED"  # these words in an overlay turn its box red
 _CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
 _GL_OFF = ("off", "0", "false", "disable", "disabled")
 
@@ -42,6 +50,89 @@ class Drawer(Protocol):
 
     def render(self, scene: mujoco.MjvScene) -> Frame:
         """The scene as its camera sees it."""
+
+
+def render(
+    solution: Solution,
+    path: str | os.PathLike[str],
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    draw: Callable[[Axes, np.ndarray], None] | None = None,
+) -> Path:
+    """Films the best chain's motion as it was replayed, not as it was planned; returns the path.
+
+    Cost, max|h| and the replay's verdict stand in the picture. A replay that turns non-finite is
+    shown up to there.
+
+    Args:
+      solution: from `solve`.
+      path: where to, ending in .mp4; its folder is made if need be.
+      fps: frames per second.
+      size: (height, width) [pixels].
+      camera: a camera of the model, see `render_frames`.
+      draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
+        for problems without a model (others do not use it).
+
+    Raises:
+      DraxError: a path, size, fps or camera that cannot be used, or neither a model nor `draw`.
+    """
+    problem = solution.problem
+    model = getattr(problem.dynamics, "mj_model", None)
+    states = solution.replayed[0]
+    shown = int(np.cumprod(np.isfinite(states).all(axis=1)).sum())
+    states, times, overlay = states[:shown], problem.times[:shown], _overlay(solution)
+    if model is not None:
+        qpos = states[:, : model.nq]
+        return render_motion(
+            model, qpos, times, path, overlay=overlay, fps=fps, size=size, camera=camera
+        )
+    if draw is None:
+        raise DraxError(
+            f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
+            "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
+        )
+    frames = _drawn_frames(draw, states, _instants(times, fps), times, overlay, size)
+    return _write_video(path, frames, fps, size)
+
+
+def replay_mode(solution: Solution) -> str:
+    """How `solution.replayed` came about."""
+    success = solution.certificate.open_loop["success"]
+    return "open loop" if success else "with feedback"
+
+
+def verdict(solution: Solution) -> str:
+    """What the replay that is shown came to, in one line."""
+    certificate, mode = solution.certificate, replay_mode(solution)
+    has_model = hasattr(solution.problem.dynamics, "mj_model")
+    engine = "MuJoCo C replay" if has_model else "float64 rollout"
+    replay = certificate.open_loop if mode == "open loop" else certificate.feedback
+    return f"{engine}, {mode}: {outcome(solution, replay)}"
+
+
+def outcome(solution: Solution, replay: Mapping[str, Any]) -> str:
+    """One replay of a certificate in words."""
+    if not np.isfinite(replay["max_deviation"]):
+        return "diverges"
+    words = ("misses the goal", "reaches the goal")
+    if solution.problem.goal is None:
+        words = ("leaves the plan", "keeps to the plan")
+    return f"{words[replay['success']]}, {replay['max_deviation']:.1e} off plan"
+
+
+def _overlay(solution: Solution) -> list[str]:
+    """Lines of text for a film."""
+    chain = solution.best_chain
+    defect = float(solution.max_defect[chain])
+    numbers = f"cost {float(solution.cost[chain]):.3g}   max|h| {defect:.1g}"
+    lines = [solution.problem.name, numbers, verdict(solution), "t = {time}"]
+    if not solution.certified:
+        breach = "the plan breaks the dynamics"
+        reason = "no replay succeeds" if solution.feasible[chain] else breach
+        lines.insert(1, f"{_UNCERTIFIED}: {reason}")
+    return lines
 
 
 def render_motion(
@@ -60,8 +151,18 @@ def render_motion(
     The arguments are those of `render_frames`; `path` ends in .mp4, and its folder is made if
     need be. The file appears once it is complete. Raises DraxError before anything is drawn.
     """
-    target = _video_path(path)
     frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
+    return _write_video(path, frames, fps, size)
+
+
+def _write_video(
+    path: str | os.PathLike[str],
+    frames: Generator[Frame, None, None],
+    fps: float,
+    size: tuple[int, int],
+) -> Path:
+    """Writes frames of a size, rounded up to even, as an H.264 mp4 that browsers play."""
+    target = _video_path(path)
     partial = target.with_name(f".{target.stem}.partial.mp4")
     try:
         partial.touch()
@@ -126,15 +227,11 @@ def _frames(
 ) -> Generator[Frame, None, None]:
     """Checks everything now, draws one frame at a time later."""
     positions, instants = _checked_motion(model, qpos, times)
-    if not (np.isfinite(fps) and fps > 0.0):
-        raise DraxError(f"fps must be positive, not {fps}")
+    at = _instants(instants, fps)
     if isinstance(overlay, str):
         raise DraxError(f"overlay is a sequence of lines, not one string: [{overlay!r}]")
     height, width = _even(size)
     view = _camera(model, positions, camera, width / height)
-    count = int((instants[-1] - instants[0]) * fps + 1e-6) + 1
-    at = instants[0] + np.arange(count) / fps
-    at = np.append(at, np.full(round(_HOLD * fps), instants[-1]))
 
     def draw() -> Generator[Frame, None, None]:
         data = mujoco.MjData(model)
@@ -148,6 +245,49 @@ def _frames(
                 yield _write(drawer.render(scene), overlay, time)
 
     return draw()
+
+
+def _drawn_frames(
+    draw: Callable[[Axes, np.ndarray], None],
+    states: np.ndarray,
+    at: Floats,
+    times: np.ndarray,
+    overlay: Sequence[str],
+    size: tuple[int, int],
+) -> Generator[Frame, None, None]:
+    """Frames at some instants of states (T, nx), drawn anew at each knot, below the overlay."""
+    height, width = _even(size)
+
+    def frames() -> Generator[Frame, None, None]:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+        dpi = height / _DRAWN_INCHES
+        top = 1.0 - _text_box(overlay, height, width)[1][3] / height
+        layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, top))
+        figure = Figure(((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout=layout)
+        canvas = FigureCanvasAgg(figure)
+        drawn, picture = -1, np.zeros((height, width, 3), np.uint8)
+        for time in at:
+            knot = int(np.searchsorted(times, time + 1e-9, side="right")) - 1
+            if knot != drawn:
+                figure.clear()
+                draw(figure.add_subplot(), states[: knot + 1])
+                canvas.draw()
+                drawn, picture = knot, np.array(canvas.buffer_rgba())[..., :3]
+            yield _write(picture, overlay, time)
+
+    return frames()
+
+
+def _instants(times: Floats, fps: float) -> Floats:
+    """When frames are taken of a motion between times (T,) [s]: its end is held."""
+    if not (np.isfinite(fps) and fps > 0.0):
+        raise DraxError(f"fps must be positive, not {fps}")
+    count = int((times[-1] - times[0]) * fps + 1e-6) + 1
+    at = times[0] + np.arange(count) / fps
+    return np.append(at, np.full(round(_HOLD * fps), times[-1]))
 
 
 def _checked_motion(
@@ -268,18 +408,31 @@ def _write(frame: Frame, lines: Sequence[str], time: float) -> Frame:
     from PIL import Image, ImageDraw
 
     height, width = frame.shape[:2]
-    template = "\n".join(lines)
-    font = _fitted_font(template.replace("{time}", "00.00 s"), height, width)
-    text = template.replace("{time}", f"{time:.2f} s")
+    font, box = _text_box(lines, height, width)
+    text = "\n".join(lines).replace("{time}", f"{time:.2f} s")
     image = Image.fromarray(frame)
     draw = ImageDraw.Draw(image, "RGBA")
     margin = height // 40
+    fill = (150, 20, 20, 210) if _UNCERTIFIED in text else (14, 18, 25, 185)
+    draw.rounded_rectangle(box, radius=margin // 2, fill=fill)
     corner = (2 * margin, 2 * margin)
-    left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
-    box = (left - margin, top - margin, right + margin, bottom + margin)
-    draw.rounded_rectangle(box, radius=margin // 2, fill=(14, 18, 25, 165))
     draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
     return np.asarray(image)
+
+
+def _text_box(
+    lines: Sequence[str], height: int, width: int
+) -> tuple[ImageFont.FreeTypeFont, tuple[float, float, float, float]]:
+    """The font, and the box (left, top, right, bottom) around the text with its margin."""
+    from PIL import Image, ImageDraw
+
+    text = "\n".join(lines).replace("{time}", "00.00 s")
+    font = _fitted_font(text, height, width)
+    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    margin = height // 40
+    corner = (2 * margin, 2 * margin)
+    left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
+    return font, (left - margin, top - margin, right + margin, bottom + margin)
 
 
 @lru_cache(maxsize=16)

@@ -5,9 +5,9 @@ Around a trajectory with defects h_k, the flow needs the minimizer d = (dx, du) 
     sum_k [ gx'dx + gu'du + 1/2 (dx'Hxx dx + 2 du'Hux dx + du'Huu du) ]_k + terminal terms
         + sum_k [ lambda_k'e_k + mu/2 |e_k|^2 ],      e_k = h_k + A_k dx_k + B_k du_k - dx_{k+1}
 
-that is d = -M^{-1} grad L_mu with M = H + mu J'J, and samples of N(0, M^{-1}). With the value function
-1/2 x'Px + p'x of the stages after k, minimizing over dx_{k+1} at fixed y = h + A dx + B du gives
-e = S^{-1} (P y + p - lambda), S = mu I + P, and
+that is d = -M^{-1} grad L_mu with M = H + mu J'J, and samples of N(0, M^{-1}). With the value
+function 1/2 x'Px + p'x of the stages after k, minimizing over dx_{k+1} at a fixed
+y = h + A dx + B du gives e = S^{-1} (P y + p - lambda), S = mu I + P, and
 
     P~ = mu S^{-1} P                          (so P~ -> P as mu -> infinity: ordinary LQR)
     p~ = S^{-1} (mu p + P lambda)
@@ -16,9 +16,9 @@ e = S^{-1} (P y + p - lambda), S = mu I + P, and
     K = -Quu^{-1} Qux      kff = -Quu^{-1} qu     P <- Qxx + Qux'K      p <- qx + Qux'kff
 
 which is the Riccati recursion with dual regularization. Nothing with a condition number near mu is
-ever formed, so float32 suffices. Given the Cholesky factors of Quu and S, the exact conditional
-distributions of N(0, M^{-1}) are du | dx ~ N(K dx, Quu^{-1}) and e | y ~ N(S^{-1}P y, S^{-1}), hence
-Newton step and noise are two solutions of one affine recursion
+ever formed, so float32 suffices. The conditional distributions of N(0, M^{-1}) are
+du | dx ~ N(K dx, Quu^{-1}) and e | y ~ N(S^{-1}P y, S^{-1}), for which the Cholesky factors of Quu
+and S are at hand. Newton step and noise are hence two solutions of one affine recursion
 
     dx_{k+1} = F_k dx_k + f_k,     F = mu S^{-1} (A + B K)
 
@@ -59,7 +59,7 @@ class Factorization:
     """What the backward recursion leaves at every stage.
 
     K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky factors
-    of Quu and S; P (K, ndx, ndx) and p (K, ndx), the value function of the state the stage leads to.
+    of Quu and S; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
     """
 
     K: Array

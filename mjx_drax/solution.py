@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -323,18 +323,17 @@ def _replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> R
     """Replay every chain's controls with the given gains, and judge where they end."""
     dynamics, bounds = problem.dynamics, problem.bounds
     chains = len(gains)
-    start = np.broadcast_to(problem.x_init, (chains, 1, dynamics.nx))
-    plan = np.concatenate([start, trajectories.x], axis=1).astype(float)
+    plan = np.asarray(problem.with_start(trajectories), float)
     states, controls = dynamics.replay(
         plan,
-        trajectories.u.astype(float),
+        np.asarray(trajectories.u, float),
         gains.astype(float),
         (np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)),
     )
-    off = np.abs(dynamics.difference(states, plan)).max(axis=-1)
-    off = np.nan_to_num(off, nan=np.inf)
-    dtype = trajectories.x.dtype
-    costs = evaluate(problem, Trajectory(states[:, 1:].astype(dtype), controls.astype(dtype))).cost
+    off = np.nan_to_num(dynamics.deviation(states, plan), nan=np.inf)
+    dtype = problem.x_init.dtype
+    replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
+    costs = evaluate(problem, replayed).cost
     reached = [_reached(problem, states[c, -1], off[c, -1]) for c in range(chains)]
     return Replays(
         states=states,

@@ -7,14 +7,19 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
 from mjx_drax import rendering
 from mjx_drax.errors import DraxError
+from mjx_drax.langevin import Langevin
+from mjx_drax.solution import Solution, solve
+from mjx_drax.tasks import load
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH = 120, 160
@@ -34,6 +39,49 @@ def _amber(frame: np.ndarray) -> np.ndarray:
     """Where (height, width) the pixels have the color of the moving links' ends."""
     red, green, blue = (frame[..., i].astype(int) for i in range(3))
     return (red > 90) & (red > green + 25) & (green > blue + 10)
+
+
+def _decoded(path: Path, height: int, width: int) -> np.ndarray:
+    """Frames (N, height, width, 3) of a film; mediapy's reader fails with this ffmpeg."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(path)]
+    pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    decoded = subprocess.run([*command, *pixels], capture_output=True, check=True).stdout
+    return np.frombuffer(decoded, np.uint8).reshape(-1, height, width, 3)
+
+
+def _distance(one: np.ndarray, other: np.ndarray) -> int:
+    """Largest difference of two frames, in 0..255."""
+    return int(np.abs(one.astype(int) - other).max())
+
+
+def _draw_angle(axes: Axes, states: np.ndarray) -> None:
+    axes.plot(np.sin(states[:, 0]), np.cos(states[:, 0]), "o-")
+    axes.set(xlim=(-2, 2), ylim=(-2, 2), aspect="equal")
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Solution:
+    settings = replace(load("pendulum").SOLVER, iterations=30, tail=20)
+    return solve(load("pendulum").make(horizon=1.0), chains=8, solver=settings)
+
+
+@pytest.fixture(scope="module")
+def cartpole() -> Solution:
+    problem = load("cartpole_swingup").make(horizon=0.2)
+    return solve(problem, chains=2, solver=Langevin(iterations=3, tail=1))
+
+
+def _judged(solution: Solution, feasible: bool, open_loop: bool, feedback: bool) -> Solution:
+    """The solution, as if this had come of all its chains and their replays."""
+    chains = solution.chains
+    return replace(
+        solution,
+        max_defect=np.full(chains, 1e-6 if feasible else 0.1),
+        open_loop=replace(solution.open_loop, success=np.full(chains, open_loop)),
+        feedback=replace(solution.feedback, success=np.full(chains, feedback)),
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -133,16 +181,103 @@ def test_video_is_one_that_browsers_play(tmp_path: Path, backend: str) -> None:
     )
     assert written == path
     assert [item.name for item in path.parent.iterdir()] == ["swing.mp4"]
-    # mediapy.read_video passes -vsync, which the ffmpeg of imageio-ffmpeg no longer knows.
+    assert len(_decoded(path, HEIGHT, WIDTH)) == 21 + 10
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(path)]
-    pixels = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    decoded = subprocess.run([*command, *pixels], capture_output=True, check=True).stdout
-    assert len(decoded) == (21 + 10) * HEIGHT * WIDTH * 3
     probe = subprocess.run(command, capture_output=True, text=True, check=False).stderr
     assert "h264" in probe
     assert "yuv420p" in probe
     content = path.read_bytes()
     assert content.index(b"moov") < content.index(b"mdat")  # the index first: plays at once
+
+
+def test_film_of_a_model_shows_the_replay(cartpole: Solution, tmp_path: Path) -> None:
+    far = cartpole.feedback.states.copy()  # neither planned nor reached open loop
+    far[:, :, 0] = np.linspace(-1.5, 1.5, far.shape[1])
+    solution = _judged(cartpole, feasible=True, open_loop=False, feedback=True)
+    solution = replace(solution, feedback=replace(solution.feedback, states=far))
+    path = rendering.render(solution, tmp_path / "film.mp4", fps=20, size=(HEIGHT, WIDTH))
+    frames = _decoded(path, HEIGHT, WIDTH)
+    assert len(frames) == 5 + 10
+    left, right = (np.argwhere(_amber(frames[i]))[:, 1].mean() for i in (0, -1))
+    assert left < 0.4 * WIDTH < 0.6 * WIDTH < right
+
+
+def test_film_of_a_function_draws_the_replay_so_far(pendulum: Solution, tmp_path: Path) -> None:
+    seen: list[np.ndarray] = []
+
+    def draw(axes: Axes, states: np.ndarray) -> None:
+        seen.append(states)
+        _draw_angle(axes, states)
+
+    path = rendering.render(pendulum, tmp_path / "film.mp4", fps=20, size=(239, 320), draw=draw)
+    frames = _decoded(path, 240, 320)
+    assert len(frames) == 21 + 10
+    assert [len(states) for states in seen] == list(range(1, 12))  # each knot once
+    np.testing.assert_array_equal(seen[-1], pendulum.replayed[0])
+    assert _distance(frames[0], frames[20]) > 100
+    assert np.abs(frames[20].astype(int) - frames[-1]).mean() < 1
+
+
+def test_film_of_a_replay_that_blows_up_stops_there(cartpole: Solution, tmp_path: Path) -> None:
+    blown = cartpole.feedback.states.copy()
+    blown[:, 6:] = np.nan
+    solution = _judged(cartpole, feasible=True, open_loop=False, feedback=False)
+    solution = replace(solution, feedback=replace(solution.feedback, states=blown))
+    path = rendering.render(solution, tmp_path / "film.mp4", fps=20, size=(HEIGHT, WIDTH))
+    assert len(_decoded(path, HEIGHT, WIDTH)) == 3 + 10
+
+
+@pytest.mark.parametrize(
+    ("feasible", "open_loop", "feedback", "warning", "mode"),
+    [
+        (True, True, True, None, "open loop: reaches the goal"),
+        (True, False, True, None, "with feedback: reaches the goal"),
+        (True, False, False, "no replay succeeds", "with feedback: misses the goal"),
+        (False, True, True, "the plan breaks the dynamics", "open loop: reaches the goal"),
+    ],
+)
+def test_overlay_says_what_is_certified(
+    cartpole: Solution,
+    pendulum: Solution,
+    feasible: bool,
+    open_loop: bool,
+    feedback: bool,
+    warning: str | None,
+    mode: str,
+) -> None:
+    for solution, engine in ((cartpole, "MuJoCo C replay"), (pendulum, "float64 rollout")):
+        judged = _judged(solution, feasible, open_loop, feedback)
+        lines = rendering._overlay(judged)
+        assert lines[0] == judged.problem.name
+        assert (f"NOT CERTIFIED: {warning}" == lines[1]) == (not judged.certified)
+        defect = "1e-06" if feasible else "0.1"
+        assert f"cost {judged.cost[judged.best_chain]:.3g}   max|h| {defect}" in lines
+        assert lines[-2].startswith(f"{engine}, {mode}, ")
+        assert lines[-1] == "t = {time}"
+
+
+def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) -> None:
+    first = []
+    for success in (True, False):
+        judged = _judged(pendulum, True, success, success)
+        # The same motion, so that only the words differ.
+        judged = replace(judged, open_loop=replace(judged.feedback))
+        path = tmp_path / f"{success}.mp4"
+        rendering.render(judged, path, fps=2, size=(240, 320), draw=_draw_angle)
+        first.append(_decoded(path, 240, 320)[0])
+    good, bad = (frame[:60].astype(int) for frame in first)
+    assert np.sum(bad[..., 0] > bad[..., 1] + 60) > 2000  # red
+    assert np.sum(good[..., 0] > good[..., 1] + 60) == 0
+
+
+def test_a_function_without_draw_has_no_film(pendulum: Solution, tmp_path: Path) -> None:
+    with pytest.raises(DraxError, match=r"pendulum has no model to film: pass draw="):
+        rendering.render(pendulum, tmp_path / "film.mp4")
+    with pytest.raises(DraxError, match="fps"):
+        rendering.render(pendulum, tmp_path / "film.mp4", draw=_draw_angle, fps=0)
+    with pytest.raises(DraxError, match="size"):
+        rendering.render(pendulum, tmp_path / "film.mp4", draw=_draw_angle, size=(0, 0))
+    assert not list(tmp_path.iterdir())
 
 
 def test_overlay_is_drawn_and_tells_the_time(backend: str) -> None:

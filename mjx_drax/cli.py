@@ -1,0 +1,310 @@
+"""The command `mjx-drax`. Heavy modules are imported where they are needed: --help is instant."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjx_drax.errors import DraxError
+
+if TYPE_CHECKING:
+    from mjx_drax.langevin import Info, Langevin
+    from mjx_drax.problem import Problem
+    from mjx_drax.solution import Solution
+
+COST_FILE = """\
+A cost file is Python. It defines at least one of
+  running_cost(data, u), terminal_cost(data)           scalars
+  running_residual(data, u), terminal_residual(data)   vectors: adds half the squared norm
+on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
+  goal(data) -> bool       what a replay in MuJoCo must reach
+  horizon, dt              [s]
+  x_init                   [qpos, qvel, act]
+  x_bounds, u_bounds       (lower, upper)
+  x_scatter, u_scatter     (lower, upper): where initial knots are drawn
+  guess(key) -> Trajectory initial knots of one chain
+  solver                   a mjx_drax.Langevin
+"""
+_PROBLEM_NAMES = (
+    "running_cost",
+    "terminal_cost",
+    "running_residual",
+    "terminal_residual",
+    "goal",
+    "horizon",
+    "dt",
+    "x_init",
+    "x_bounds",
+    "u_bounds",
+    "x_scatter",
+    "u_scatter",
+    "guess",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; the exit status is 0 if it did what was asked for, 1 or 2 if not."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except DraxError as error:
+        print(f"mjx-drax: error: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mjx-drax",
+        description="Trajectories for MuJoCo models by equality-constrained diffusion.",
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    listing = commands.add_parser("list", help="list the tasks")
+    listing.set_defaults(run=_list)
+
+    solving = commands.add_parser(
+        "solve",
+        help="solve a task, or a model and cost of your own",
+        description="Solve a task, or a model and cost of your own; replay it; film it.",
+        epilog=COST_FILE + "\nThe exit status is 0 only if the best trajectory is certified.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    solving.add_argument("task", nargs="?", help="a name from `mjx-drax list`")
+    solving.add_argument("--model", metavar="XML", help="MJCF file of your own, with --cost")
+    solving.add_argument("--cost", metavar="PY", help="Python file with the cost (see below)")
+    solving.add_argument("--chains", type=_positive, metavar="N", help="number of chains")
+    solving.add_argument(
+        "--iterations",
+        type=_positive,
+        metavar="K",
+        help="iterations with noise; the noise-free tail keeps its share",
+    )
+    solving.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
+    solving.add_argument("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
+    solving.add_argument("--out", metavar="DIR", help="default out/TASK")
+    solving.add_argument("--no-video", action="store_true", help="leave out video.mp4")
+    solving.set_defaults(run=_solve)
+
+    measuring = commands.add_parser(
+        "benchmark",
+        help="measure success and time of the tasks",
+        description="Solve tasks for several seeds; print a table, save it as benchmark.json.",
+    )
+    measuring.add_argument("tasks", nargs="*", metavar="TASK", help="default: all of them")
+    measuring.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="S")
+    measuring.add_argument("--chains", type=_positive, metavar="N", help="default: each task's own")
+    measuring.add_argument("--out", metavar="DIR", default="out/benchmark")
+    measuring.set_defaults(run=_benchmark)
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not at least 1")
+    return value
+
+
+def _list(options: argparse.Namespace) -> int:
+    from mjx_drax import tasks
+
+    width = max(map(len, tasks.names()))
+    for name in tasks.names():
+        print(f"{name:{width}}  {tasks.summary(name)}")
+    return 0
+
+
+def _solve(options: argparse.Namespace) -> int:
+    problem, solver, chains, draw = (
+        _own_problem(options) if options.task is None else _task(options)
+    )
+    from mjx_drax import results
+    from mjx_drax.solution import solve
+
+    if options.iterations is not None:
+        tail = max(1, round(options.iterations / solver.iterations * solver.tail))
+        solver = replace(solver, iterations=options.iterations, tail=tail)
+    folder = results.writable(options.out or Path("out") / problem.name)
+    _cache_compilations()
+
+    chains = options.chains or chains
+    say(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
+    with _Bar() as bar:
+        solution = solve(problem, chains, options.seed, solver, progress=bar)
+    results.save(solution, folder)
+    from mjx_drax.plotting import plot_solution
+
+    plot_solution(solution, folder / "plot.png", draw=draw)
+    written = ["result.json", "result.npz", "plot.png"]
+    if not options.no_video and (draw is not None or hasattr(problem.dynamics, "mj_model")):
+        from mjx_drax.rendering import render
+
+        render(solution, folder / "video.mp4", draw=draw)
+        written.append("video.mp4")
+    _report(solution)
+    say(f"written to {folder}/: {', '.join(written)}")
+    return 0 if solution.certified else 1
+
+
+def _benchmark(options: argparse.Namespace) -> int:
+    from mjx_drax import results, tasks
+
+    for name in options.tasks:
+        tasks.load(name)
+    folder = results.writable(options.out)
+    from mjx_drax import benchmark
+
+    say(benchmark.HEADER)
+    rows = benchmark.run(
+        options.tasks or tasks.names(),
+        options.seeds,
+        options.chains,
+        report=lambda row: say(benchmark.line(row)),
+    )
+    say(f"written to {benchmark.save(rows, folder)}")
+    return 0 if all(row["certified"] for row in rows) else 1
+
+
+def _task(options: argparse.Namespace) -> tuple[Problem, Langevin, int, Callable[..., Any] | None]:
+    """Problem, settings, number of chains and drawing function of a named task."""
+    from mjx_drax import Langevin, tasks
+
+    if options.model or options.cost:
+        raise DraxError(
+            f"both the task {options.task!r} and --model or --cost are given: choose one."
+        )
+    task = tasks.load(options.task)
+    problem = task.make() if options.horizon is None else task.make(horizon=options.horizon)
+    solver = getattr(task, "SOLVER", None) or Langevin()
+    return problem, solver, getattr(task, "CHAINS", 64), getattr(task, "draw", None)
+
+
+def _own_problem(
+    options: argparse.Namespace,
+) -> tuple[Problem, Langevin, int, Callable[..., Any] | None]:
+    """The same for the user's own model and cost file."""
+    if not (options.model and options.cost):
+        raise DraxError("give a task (see `mjx-drax list`), or both --model XML and --cost PY.")
+    from mjx_drax import Langevin, from_mjcf
+
+    module = _load_cost_file(Path(options.cost))
+    given = {n: getattr(module, n) for n in _PROBLEM_NAMES if hasattr(module, n)}
+    if options.horizon is not None:
+        given["horizon"] = options.horizon
+    if "horizon" not in given:
+        raise DraxError(f"no horizon: define it in {options.cost} or give --horizon SECONDS.")
+    problem = from_mjcf(options.model, name=Path(options.model).stem, **given)
+    solver = getattr(module, "solver", None) or Langevin()
+    if not isinstance(solver, Langevin):
+        raise DraxError(f"solver in {options.cost} is {solver!r}: it must be a mjx_drax.Langevin.")
+    return problem, solver, 64, None
+
+
+def _load_cost_file(path: Path) -> Any:
+    """The cost file as a module; files beside it can be imported by it."""
+    if not path.is_file():
+        raise DraxError(f"there is no cost file {str(path)!r}: check the path.")
+    spec = importlib.util.spec_from_file_location("mjx_drax_cost", path)
+    if spec is None or spec.loader is None:
+        raise DraxError(
+            f"the cost file {str(path)!r} is not a Python file: its name must end in .py."
+        )
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise DraxError(
+            f"the cost file {str(path)!r} failed: {type(error).__name__}: {error}"
+        ) from error
+    finally:
+        sys.path.pop(0)
+    return module
+
+
+def _cache_compilations() -> None:
+    """Keep compiled programs between runs, so that a second run starts at once."""
+    import jax
+
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "mjx_drax" / "jax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+class _Bar:
+    """A progress bar with the two numbers that matter: best feasible cost, share feasible."""
+
+    def __enter__(self) -> _Bar:
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=None, unit="it", file=sys.stderr, bar_format=self._FORMAT)
+        return self
+
+    _FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+    def __call__(self, done: int, total: int, info: Info) -> None:
+        import numpy as np
+
+        from mjx_drax.langevin import FEASIBLE
+
+        feasible = np.asarray(info.max_defect) < FEASIBLE
+        best = np.asarray(info.cost)[feasible].min(initial=np.inf)
+        self._bar.total = total
+        self._bar.set_postfix_str(f"best cost {best:.4g}, feasible {feasible.mean():.0%}", False)
+        self._bar.update(done - self._bar.n)
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+
+def _report(solution: Solution) -> None:
+    """The summary for a person."""
+    best, certificate = solution.best_chain, solution.certificate
+    status = solution.status
+    counts = ", ".join(f"{status.count(name)} {name}" for name in sorted(set(status)))
+    rate = f"{solution.success_rate:.1%} succeed when replayed"
+    say(f"chains       {solution.chains}: {counts}; {rate}")
+    say(
+        f"best         cost {solution.cost[best]:.5g}, max|h| {solution.max_defect[best]:.1e}, "
+        f"bound violation {solution.max_violation[best]:.1e}"
+    )
+    for label, run in (
+        ("open loop", certificate.open_loop),
+        ("feedback", certificate.feedback),
+    ):
+        verdict = "reaches the goal" if run["success"] else "misses the goal"
+        if solution.problem.goal is None:
+            verdict = "follows the plan" if run["success"] else "leaves the plan"
+        say(
+            f"{label:12} {verdict}, ends {run['final_deviation']:.1e} off the plan "
+            f"(at most {run['max_deviation']:.1e}), cost {run['cost']:.5g}"
+        )
+    say(f"engine       {certificate.engine}")
+    say(f"time         compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s")
+    say("CERTIFIED" if solution.certified else "NOT CERTIFIED: " + _advice(solution))
+
+
+def _advice(solution: Solution) -> str:
+    """What to try when no chain could be certified."""
+    if not solution.feasible.any():
+        return "no chain satisfies the dynamics. Try more --iterations, or a longer --horizon."
+    return (
+        "feasible chains miss the goal when replayed. Try more --chains, a higher weight on the "
+        "terminal cost, or a longer --horizon."
+    )
+
+
+def say(line: str) -> None:
+    """One line for the user, at once."""
+    print(line, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Result files: `result.json` for reading, `result.npz` for computing."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_drax import __version__
+from mjx_drax.errors import DraxError
+from mjx_drax.solution import Solution
+
+
+def summary(solution: Solution) -> dict[str, Any]:
+    """What `result.json` holds: settings, the best chain's numbers, certificate, versions."""
+    best, certificate = solution.best_chain, solution.certificate
+    status = solution.status
+    return {
+        "task": solution.problem.name,
+        "seed": solution.seed,
+        "chains": solution.chains,
+        "iterations": solution.iterations,
+        "horizon": solution.problem.horizon,
+        "dt": float(solution.problem.dynamics.dt),
+        "compile_time_s": solution.compile_time,
+        "solve_time_s": solution.solve_time,
+        "best_chain": best,
+        "certified": solution.certified,
+        "cost": _number(solution.cost[best]),
+        "max_defect": _number(solution.max_defect[best]),
+        "max_bound_violation": _number(solution.max_violation[best]),
+        "success_rate": solution.success_rate,
+        "status": {name: status.count(name) for name in sorted(set(status))},
+        "certificate": {
+            "engine": certificate.engine,
+            "open_loop": _finite(certificate.open_loop),
+            "feedback": _finite(certificate.feedback),
+        },
+        "versions": {
+            "python": sys.version.split()[0],
+            "mjx-drax": __version__,
+            **{name: version(name) for name in ("jax", "mujoco", "mujoco-mjx", "numpy")},
+        },
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def arrays(solution: Solution) -> dict[str, np.ndarray]:
+    """What `result.npz` holds: the best chain, its replay, and numbers of every chain.
+
+    times (K+1,); states (K+1, nx), controls (K, nu), multipliers (K, ndx) and gains (K, nu, ndx) of
+    the best chain's plan; replayed_states and replayed_controls; chain_* (chains,); history_*
+    (records,) or (records, chains).
+    """
+    best = solution.best_chain
+    replayed_states, replayed_controls = solution.replayed
+    return {
+        "times": solution.problem.times,
+        "states": np.asarray(solution.problem.with_start(solution.best)),
+        "controls": np.asarray(solution.best.u),
+        "multipliers": solution.multipliers[best],
+        "gains": solution.gains[best],
+        "replayed_states": replayed_states,
+        "replayed_controls": replayed_controls,
+        "chain_cost": solution.cost,
+        "chain_max_defect": solution.max_defect,
+        "chain_max_violation": solution.max_violation,
+        "chain_success": solution.success,
+        "chain_status": np.array(solution.status),
+        "chain_converged_at": solution.converged_at,
+        "chain_died_at": solution.died_at,
+        **{f"history_{name}": values for name, values in solution.history.items()},
+    }
+
+
+def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
+    """Write result.json and result.npz into a folder, each at once or not at all.
+
+    Raises:
+        DraxError: the folder cannot be written to.
+    """
+    folder = writable(folder)
+    partial = folder / ".result.partial.npz"
+    np.savez_compressed(partial, **arrays(solution))  # type: ignore[arg-type]
+    partial.replace(folder / "result.npz")
+    partial = folder / ".result.partial.json"
+    partial.write_text(json.dumps(summary(solution), indent=2) + "\n", encoding="utf-8")
+    partial.replace(folder / "result.json")
+    return folder
+
+
+def writable(folder: str | os.PathLike[str]) -> Path:
+    """The folder, made if need be; call it before a long computation.
+
+    Raises:
+        DraxError: it cannot be made or written to.
+    """
+    path = Path(folder).expanduser()
+    probe = path / ".writable"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise DraxError(
+            f"cannot write to the folder {str(path)!r}: {error.strerror or error}. "
+            "Choose another with --out, or make it writable."
+        ) from error
+    return path
+
+
+def _number(value: Any) -> float | None:
+    """A float, or None (JSON has no NaN) where it is not finite."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _finite(numbers: dict[str, Any]) -> dict[str, Any]:
+    return {k: v if isinstance(v, bool) else _number(v) for k, v in numbers.items()}

@@ -1,0 +1,155 @@
+"""The Riccati recursion against dense linear algebra, M = H + mu J'J, and against textbook LQR."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, solve_discrete_are
+
+from mjx_drax.linearize import Linearization
+from mjx_drax.riccati import QuadraticCost, factorize, solve_and_sample
+
+K, NDX, NU = 6, 3, 2
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+def drawn(seed):
+    """A linear model, a convex quadratic cost and multipliers, all random."""
+    rng = np.random.default_rng(seed)
+    A, B, h = (rng.normal(size=(K, NDX, *n)) for n in [(NDX,), (NU,), ()])
+    root = rng.normal(size=(K + 1, NDX + NU, NDX + NU))
+    H = root @ root.swapaxes(1, 2) + 0.1 * np.eye(NDX + NU)
+    g = rng.normal(size=(K + 1, NDX + NU))
+    cost = QuadraticCost(
+        g[:, :NDX], g[:-1, NDX:], H[:, :NDX, :NDX], H[:-1, NDX:, :NDX], H[:-1, NDX:, NDX:]
+    )
+    return Linearization(A, B, h), cost, rng.normal(size=(K, NDX))
+
+
+def dense(model, cost):
+    """Hessian H, gradient g and Jacobian J over z = [x_1..x_K, u_0..u_{K-1}]."""
+    n = K * NDX
+    H = block_diag(*cost.Hxx[1:], *cost.Huu)
+    for k in range(1, K):  # x_k is in block k - 1
+        x, u = slice((k - 1) * NDX, k * NDX), slice(n + k * NU, n + (k + 1) * NU)
+        H[u, x] = cost.Hux[k]
+        H[x, u] = cost.Hux[k].T
+    from_states = -np.eye(n)
+    from_states[NDX:, :-NDX] += block_diag(*model.A[1:])
+    J = np.hstack([from_states, block_diag(*model.B)])
+    return H, np.concatenate([cost.gx[1:].ravel(), cost.gu.ravel()]), J
+
+
+def flat(x, u):
+    return np.concatenate([np.ravel(x), np.ravel(u)])
+
+
+@jax.jit
+def newton(model, cost, multipliers, mu, key):
+    factors = factorize(model, cost, multipliers, mu)
+    return solve_and_sample(model, factors, multipliers, mu, key)
+
+
+@pytest.mark.parametrize("mu", [0.1, 10.0, 1e5])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_step_is_newtons_and_multipliers_follow_the_predicted_defect(mu, seed):
+    model, cost, multipliers = drawn(seed)
+    H, g, J = dense(model, cost)
+    h, lam = model.h.ravel(), multipliers.ravel()
+    d = -np.linalg.solve(H + mu * J.T @ J, g + J.T @ (lam + mu * h))
+    dx, du, _, _, rate = newton(model, cost, multipliers, mu, KEY)
+    np.testing.assert_allclose(flat(dx, du), d, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(np.ravel(rate), mu * (h + J @ d), rtol=1e-7, atol=1e-5)
+
+
+def test_float32_needs_no_digits_for_the_penalty():
+    model, cost, multipliers = drawn(2)
+    H, g, J = dense(model, cost)
+    mu = 1e6  # M has a condition number far beyond 1 / eps
+    d = -np.linalg.solve(
+        H + mu * J.T @ J, g + J.T @ (multipliers.ravel() + mu * model.h.ravel())
+    )
+    single = jax.tree.map(np.float32, (model, cost, multipliers, mu))
+    dx, du, *_ = newton(*single, KEY)
+    assert dx.dtype == np.float32
+    np.testing.assert_allclose(flat(dx, du), d, rtol=1e-3, atol=1e-3 * np.abs(d).max())
+
+
+@pytest.mark.parametrize("mu", [0.1, 10.0, 1e4])
+def test_noise_covariance_is_exactly_the_inverse_of_M(mu, monkeypatch):
+    model, cost, multipliers = drawn(3)
+    H, _, J = dense(model, cost)
+
+    def noise(white):
+        drafts = iter([white[: K * NU].reshape(K, NU), white[K * NU :].reshape(K, NDX)])
+        monkeypatch.setattr(jax.random, "normal", lambda *_: next(drafts))
+        factors = factorize(model, cost, multipliers, mu)
+        _, _, nx, nu, _ = solve_and_sample(model, factors, multipliers, mu, KEY)
+        return jnp.concatenate([nx.ravel(), nu.ravel()])
+
+    zero = np.zeros(K * (NDX + NU))
+    assert not np.any(noise(zero))
+    L = jax.jit(jax.jacfwd(noise))(zero)
+    inverse = np.linalg.inv(H + mu * J.T @ J)
+    np.testing.assert_allclose(L @ L.T, inverse, rtol=1e-8, atol=1e-8 * inverse.max())
+
+
+def test_sampled_noise_is_white_in_the_metric():
+    model, cost, multipliers = drawn(4)
+    H, _, J = dense(model, cost)
+    mu, samples = 10.0, 20_000
+    keys = jax.random.split(KEY, samples)
+    _, _, nx, nu, _ = jax.vmap(newton, (None, None, None, None, 0))(
+        model, cost, multipliers, mu, keys
+    )
+    n = np.hstack([nx.reshape(samples, -1), nu.reshape(samples, -1)])
+    white = n @ np.linalg.cholesky(H + mu * J.T @ J)  # L'n ~ N(0, I) for M = L L'
+    np.testing.assert_allclose(white.mean(0), 0, atol=6 / samples**0.5)
+    covariance = white.T @ white / samples
+    np.testing.assert_allclose(covariance, np.eye(len(H)), atol=6 * (2 / samples) ** 0.5)
+
+
+def lqr(A, B, cost):
+    """Textbook gains of u_k = K_k x_k, backwards from the terminal cost."""
+    P, gains = cost.Hxx[-1], []
+    for k in reversed(range(len(A))):
+        Quu = cost.Huu[k] + B[k].T @ P @ B[k]
+        Qux = cost.Hux[k] + B[k].T @ P @ A[k]
+        gains.append(-np.linalg.solve(Quu, Qux))
+        P = cost.Hxx[k] + A[k].T @ P @ A[k] - Qux.T @ np.linalg.solve(Quu, Qux)
+    return np.array(gains[::-1])
+
+
+def test_stiff_penalty_gives_lqr():
+    model, cost, multipliers = drawn(5)
+    gains = jax.jit(factorize)(model, cost, multipliers, 1e10).K
+    np.testing.assert_allclose(gains, lqr(model.A, model.B, cost), rtol=1e-6, atol=1e-6)
+
+
+def test_long_horizon_gives_the_stationary_lqr():
+    rng = np.random.default_rng(6)
+    A, B, long = rng.normal(size=(NDX, NDX)), rng.normal(size=(NDX, NU)), 100
+    Q, R = np.eye(NDX), 2.0 * np.eye(NU)
+    P = solve_discrete_are(A, B, Q, R)
+    stationary = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+
+    def every(a, n=long):
+        return np.broadcast_to(a, (n, *a.shape))
+
+    model = Linearization(every(A), every(B), np.zeros((long, NDX)))
+    cost = QuadraticCost(
+        np.zeros((long + 1, NDX)),
+        np.zeros((long, NU)),
+        every(Q, long + 1),
+        np.zeros((long, NU, NDX)),
+        every(R),
+    )
+    factors = jax.jit(factorize)(model, cost, np.zeros((long, NDX)), 1e10)
+    np.testing.assert_allclose(factors.K[0], stationary, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(factors.P[0], P, rtol=1e-6, atol=1e-6)
