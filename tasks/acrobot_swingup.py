@@ -8,18 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax import Geometric, Langevin, Problem, from_mjcf
+from mjx_drax import Problem, from_mjcf
 from mjx_drax.models import path
 
 DT = 0.02  # [s]
-SOLVER = Langevin(
-    iterations=100,
-    tail=60,
-    noise=Geometric(0.3, 0.01),
-    penalty=Geometric(1000.0, 1000.0, 1e4),
-    damping=Geometric(0.1, 0.1),
-    barrier_weight=Geometric(0.1, 1e-2, 1e-3),
-)
 
 
 def make(horizon: float = 3.0) -> Problem:

@@ -8,18 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax import Geometric, Langevin, Problem, from_mjcf
+from mjx_drax import Langevin, Problem, from_mjcf
 from mjx_drax.models import path
 
 DT = 0.02  # [s]
-SOLVER = Langevin(
-    iterations=60,
-    tail=30,
-    noise=Geometric(0.3, 0.01),
-    penalty=Geometric(100.0, 1000.0),
-    damping=Geometric(0.1, 1e-2),
-    barrier_weight=Geometric(0.1, 1e-3, 1e-4),
-)
+SOLVER = Langevin(iterations=60, tail=30)
 
 
 def make(horizon: float = 2.0) -> Problem:

@@ -8,18 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax import Geometric, Langevin, Problem, from_mjcf
+from mjx_drax import Problem, from_mjcf
 from mjx_drax.models import path
 
 DT = 0.05  # [s]
-SOLVER = Langevin(
-    iterations=80,
-    tail=40,
-    noise=Geometric(0.3, 0.01),
-    penalty=Geometric(100.0, 1000.0),
-    damping=Geometric(0.1, 1e-2),
-    barrier_weight=Geometric(0.1, 1e-3, 1e-4),
-)
 
 
 def make(horizon: float = 5.0) -> Problem:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from mjx_drax import Constant, Identity, Langevin, LogBarrier, Trajectory, from_function, solve
 from mjx_drax.problem import Box, box
@@ -45,7 +46,7 @@ def test_value_is_minus_the_sum_of_log_slacks_of_a_stage():
 def test_derivatives_are_those_of_the_value():
     with jax.enable_x64(True):
         z = jax.tree.map(lambda a: jnp.asarray(a, float), inside())
-        points, unravel = jax.flatten_util.ravel_pytree(z)
+        points, unravel = ravel_pytree(z)
 
         def value(p):
             return BARRIER.value(BOUNDS, unravel(p)).sum()
@@ -70,7 +71,7 @@ def test_time_varying_bounds_hold_knot_by_knot():
     bounds = replace(FREE, x_lower=-ends, x_upper=ends)
     z = BARRIER.confine(bounds, inside(), Trajectory(np.full((K, NX), 9.0), np.zeros((K, NU))))
     assert_inside(bounds, z, strictly=True)
-    assert np.all(np.diff(z.x[:, 0] - inside().x[:, 0] * 0.1) > 0)  # 0.1 z + 0.9 upper, growing
+    np.testing.assert_allclose(z.x, 0.1 * inside().x + 0.9 * ends, rtol=1e-5)
     assert bounds.violation(Trajectory(ends + 0.25, np.zeros((K, NU)))) == pytest.approx(0.25)
 
 
@@ -96,7 +97,7 @@ def test_no_number_of_huge_steps_leaves_the_box_or_breaks_the_derivatives(sign):
         z = BARRIER.confine(BOUNDS, z, jax.tree.map(lambda a: a + sign * 1e30, z))
         assert_inside(BOUNDS, z)
     bounded = jnp.isfinite(flat(BOUNDS.sides(z)[sign > 0]))
-    assert np.isfinite(BARRIER.value(BOUNDS, z)).all() or not bounded.all()
+    assert np.isfinite(BARRIER.value(BOUNDS, z)).all()
     for part in BARRIER.derivatives(BOUNDS, z):
         assert part.x.dtype == np.float32
         assert np.isfinite(flat(part)).all()

@@ -1,0 +1,308 @@
+"""Dynamics, bounds and initial states from MJCF, against MuJoCo's C engine; and what is refused."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError, Trajectory, from_mjcf
+from mjx_drax.langevin import evaluate
+from mjx_drax.linearize import autodiff
+from mjx_drax.models import path
+
+MODELS = ["pendulum", "cartpole", "acrobot"]
+K = 8
+
+ARM = """
+<mujoco model="arm">
+  <option timestep="0.005"><flag contact="disable"/></option>
+  <worldbody>
+    <body><joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.25" limited="true"/>
+      <geom name="hand" size="0.1"/>
+      <body pos="0.3 0 0"><joint name="wrist" axis="0 1 0" {joint}/>
+        <geom name="finger" size="0.1" pos="1 0 0"/></body>
+    </body>
+    {world}
+  </worldbody>
+  <actuator>{actuator}</actuator>
+  {more}
+</mujoco>"""
+MOTORS = (
+    '<motor joint="lift" ctrlrange="-2 3" ctrllimited="true"/>'
+    '<general joint="wrist" dyntype="filter" dynprm="0.1" gainprm="1"/>'
+)
+
+
+def arm(joint="", world="", actuator=MOTORS, more="", contact=False):
+    xml = ARM.format(joint=joint, world=world, actuator=actuator, more=more)
+    return xml.replace('<flag contact="disable"/>', "") if contact else xml
+
+
+def effort(data, u):
+    return u
+
+
+def pose(data):
+    return data.qpos
+
+
+def problem(model, horizon=0.16, **rest):
+    model = path(model) if model in MODELS else model
+    return from_mjcf(model, **{"horizon": horizon, "running_residual": effort, **rest})
+
+
+def drawn(problem, seed=0):
+    """Random states x_0..x_K inside the bounds, and controls."""
+    rng = np.random.default_rng(seed)
+    upper = problem.bounds.x_upper
+    half = np.where(np.isfinite(upper), upper, 3.0)
+    x = rng.uniform(-half, half, (K + 1, problem.dynamics.nx))
+    return x, rng.uniform(-1, 1, (K, problem.dynamics.nu))
+
+
+def c_step(model, x, u, substeps):
+    """The C engine, from x under u."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
+    data.ctrl[:] = u
+    mujoco.mj_step(model, data, substeps)
+    return np.concatenate([data.qpos, data.qvel, data.act])
+
+
+def c_jacobian(model, x, u, substeps, eps=1e-5):
+    """[A B] by central differences of the C engine."""
+    z = np.concatenate([x, u])
+
+    def f(z):
+        return c_step(model, *np.split(z, [len(x)]), substeps)
+
+    return np.stack([f(z + e) - f(z - e) for e in eps * np.eye(len(z))], axis=1) / (2 * eps)
+
+
+@pytest.mark.parametrize("model", [*MODELS, arm()], ids=[*MODELS, "with activation"])
+def test_step_and_jacobians_are_the_c_engines_in_float64(model):
+    with jax.enable_x64(True):
+        task = problem(model, horizon=K * 0.02, dt=0.02)
+        x, u = drawn(task)
+        at = replace(task, x_init=jnp.asarray(x[0]))
+        linear = jax.jit(autodiff)(at, Trajectory(jnp.asarray(x[1:]), jnp.asarray(u)))
+        linear = jax.tree.map(np.asarray, linear)
+    host, substeps = task.dynamics.mj_model, task.dynamics.substeps
+    assert substeps == round(0.02 / host.opt.timestep) >= 2
+    for k in range(K):
+        stepped = c_step(host, x[k], u[k], substeps)
+        np.testing.assert_allclose(linear.h[k] + x[k + 1], stepped, atol=1e-10)
+        AB = np.hstack([linear.A[k], linear.B[k]])
+        np.testing.assert_allclose(AB, c_jacobian(host, x[k], u[k], substeps), atol=1e-7)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_one_step_is_the_c_engines_in_float32(model):
+    task = problem(model, dt=0.01)
+    assert task.dynamics.substeps == 1
+    x, u = drawn(task, seed=1)
+    seen = jax.vmap(task.dynamics.step)(x[:-1].astype(np.float32), u.astype(np.float32))
+    assert seen.dtype == np.float32
+    for k in range(K):
+        wanted = c_step(task.dynamics.mj_model, x[k], u[k], 1)
+        np.testing.assert_allclose(seen[k], wanted, atol=1e-4)
+
+
+def test_costs_observe_what_the_c_engine_computes():
+    task = problem("acrobot")
+    x, u = drawn(task)
+    seen = jax.jit(task.dynamics.observe)(x[0].astype(np.float32), u[0].astype(np.float32))
+    wanted = task.dynamics.observe_replayed(x[0])
+    for part in ("qpos", "qvel", "site_xpos", "xpos"):
+        np.testing.assert_allclose(getattr(seen, part), getattr(wanted, part), atol=1e-5)
+
+
+def test_what_a_cost_does_not_read_is_not_computed():
+    def flops(residual):
+        task = problem("acrobot", running_residual=residual)
+        x, u = drawn(task)
+        cost = jax.jit(task.running_cost).lower(x[0], u[0]).compile()
+        return cost.cost_analysis()["flops"]
+
+    assert 20 * flops(lambda data, u: data.qpos) < flops(lambda data, u: data.site_xpos[0])
+
+
+def test_ranges_become_bounds():
+    bounds = problem(arm()).bounds
+    inf = np.inf
+    np.testing.assert_allclose(bounds.x_lower, [-0.5, -inf, -inf, -inf, -inf])
+    np.testing.assert_allclose(bounds.x_upper, [0.25, inf, inf, inf, inf])
+    np.testing.assert_allclose(bounds.u_lower, [-2.0, -inf])
+    np.testing.assert_allclose(bounds.u_upper, [3.0, inf])
+
+
+def test_given_bounds_are_added_to_the_ranges():
+    bounds = problem(arm(), x_bounds=(-0.1, 1.0), u_bounds=([-1.0, -5.0], [9.0, 5.0])).bounds
+    np.testing.assert_allclose(bounds.x_lower, [-0.1] * 5)
+    np.testing.assert_allclose(bounds.x_upper, [0.25, 1, 1, 1, 1])
+    np.testing.assert_allclose(bounds.u_lower, [-1.0, -5.0])
+    np.testing.assert_allclose(bounds.u_upper, [3.0, 5.0])
+
+
+def test_scatter_is_finite_and_inside_the_bounds():
+    task = problem(arm())
+    z = task.draw(jax.random.key(0))
+    assert np.isfinite(z.x).all()
+    assert task.bounds.violation(z) == 0
+    np.testing.assert_allclose(task.scatter.x_upper, [0.25, np.pi, 5, 5, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("timestep", "substeps"), [(0.01, 2), (0.005, 4), (0.003, 7), (0.05, 1)])
+def test_default_dt_is_the_multiple_closest_to_20_ms(timestep, substeps):
+    dynamics = problem(arm().replace("0.005", str(timestep)), horizon=1.0).dynamics
+    assert dynamics.substeps == substeps
+    assert dynamics.dt == pytest.approx(substeps * timestep)
+
+
+def test_horizon_counts_knots():
+    task = problem(arm(), horizon=0.5, dt=0.01)
+    assert task.horizon == 50
+    assert task.times[-1] == pytest.approx(0.5)
+
+
+def test_the_initial_state_is_the_default_pose_or_the_first_keyframe_or_what_is_given():
+    np.testing.assert_array_equal(problem(arm()).x_init, np.zeros(5))
+    key = '<keyframe><key qpos="0.1 2" qvel="3 4" act="5"/><key qpos="0 9"/></keyframe>'
+    np.testing.assert_allclose(problem(arm(more=key)).x_init, [0.1, 2, 3, 4, 5])
+    given = [0.2, 1.0, 0.0, 0.0, 0.5]
+    np.testing.assert_allclose(problem(arm(more=key), x_init=given).x_init, given)
+
+
+def test_a_model_is_a_file_a_string_or_an_mjmodel():
+    models = [path("pendulum"), str(path("pendulum")), path("pendulum").read_text()]
+    for model in [*models, mujoco.MjModel.from_xml_path(models[1])]:
+        assert from_mjcf(model, horizon=0.1, running_residual=effort).name == "pendulum"
+
+
+def test_another_mass_changes_the_motion_without_recompiling():
+    model = mujoco.MjModel.from_xml_path(str(path("pendulum")))
+    light = problem(model)
+    model.body_mass[1:] *= 2
+    heavy = problem(model)
+    z = jax.tree.map(lambda a: a[None], light.draw(jax.random.key(0)))
+    before = evaluate._cache_size()
+    defects = [evaluate(task, z).max_defect for task in (light, heavy, problem("pendulum"))]
+    assert evaluate._cache_size() - before == 1
+    assert defects[0] == defects[2]
+    assert defects[0] != defects[1]
+
+
+def test_a_model_is_left_as_it_was():
+    model = mujoco.MjModel.from_xml_string(arm())
+    flags = model.opt.disableflags
+    problem(model)
+    assert model.opt.disableflags == flags
+
+
+def test_geoms_that_cannot_touch_are_no_reason_to_refuse():
+    harmless = '<geom type="plane" size="1 1 1" contype="0" conaffinity="0"/>'
+    problem(arm(world=harmless, contact=True))  # hand and finger: parent and child
+
+
+BALL = '<body><joint name="hip" type="ball"/><geom size="1"/></body>'
+FREE = '<body><freejoint name="base"/><geom size="1"/></body>'
+FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
+WELD = '<equality><joint joint1="lift" joint2="wrist"/></equality>'
+STILL = '<mujoco model="rock"><worldbody><geom size="1"/></worldbody></mujoco>'
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (arm(world=FREE), "joint 'base' of arm is a free joint"),
+        (arm(world=BALL), "joint 'hip' of arm is a ball joint"),
+        (arm(world=FLOOR, contact=True), "'floor' and 'hand'.*contact"),
+        (arm(more='<contact><pair geom1="hand" geom2="finger"/></contact>', contact=True), "'hand'"),
+        (arm(more=WELD), "1 equality constraint"),
+        (arm(actuator=""), "no actuators"),
+        (arm(joint='frictionloss="0.1"'), "friction"),
+        (arm(joint='range="-1 1" limited="true" margin="0.1"'), "margin"),
+        (STILL, "rock has no joints"),
+        ("nowhere.xml", "no model file 'nowhere.xml'"),
+        (path("nowhere"), "no model file .*nowhere.xml"),
+        ("<mujoco><worldbody><geom/></mujoco>", "MuJoCo cannot compile"),
+        ("<mujoco><worldbody><geom sise='1'/></worldbody></mujoco>", "(?s)cannot compile.*sise"),
+    ],
+)
+def test_models_that_are_refused(model, words):
+    with pytest.raises(DraxError, match=words):
+        problem(model)
+
+
+@pytest.mark.parametrize("attribute", ['joint="wrist"', 'tendon="string"'])
+def test_dry_friction_of_joints_and_limited_tendons_are_refused(attribute):
+    if "tendon" in attribute:
+        more = (
+            '<tendon><fixed name="string" limited="true" range="0 1">'
+            '<joint joint="wrist" coef="1"/></fixed></tendon>'
+        )
+        model = arm(more=more)
+    else:
+        model = arm(joint='frictionloss="1"')
+    with pytest.raises(DraxError, match="friction or limited tendons"):
+        problem(model)
+
+
+def fails(data, *u):
+    raise KeyError("no such sensor")
+
+
+def branches(data, *u):
+    return 1.0 if data.qpos[0] > 0 else 2.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"dt": 0.013}, r"dt is 0.013 s, not a multiple .* 0.005 s: give 0.015"),
+        ({"dt": 0.001}, r"not a multiple .* give 0.005"),
+        ({"dt": -0.01}, "dt is -0.01"),
+        ({"dt": np.nan}, "dt is nan"),
+        ({"horizon": 0.0}, "horizon is 0.0"),
+        ({"horizon": -1.0}, "horizon is -1.0"),
+        ({"horizon": np.inf}, "horizon is inf"),
+        ({"horizon": 0.004}, "horizon is 0.004 s, shorter"),
+        ({"x_init": [0.0, 0.0]}, r"x_init has 2 numbers; arm has 5: qpos \(2\)"),
+        ({"x_init": np.zeros((2, 5))}, "(?s)x_init is .*give a vector"),
+        ({"x_init": [0.3, 0, 0, 0, 0]}, r"x_init = .*outside the bounds of x by 0.05"),
+        ({"x_init": [0, np.nan, 0, 0, 0]}, "x_init is .*nan.*finite"),
+        ({"x_init": "down"}, "x_init is 'down'"),
+        ({"x_bounds": (0.3, 1.0)}, "bounds of x cross at element 0: lower 0.3.*, upper 0.25"),
+        ({"u_bounds": (-1, [1, -2])}, "bounds of u cross at element 1: lower -1.0, upper -2.0"),
+        ({"u_bounds": (np.nan, 1.0)}, "bounds of u cross at element 0: lower nan"),
+        ({"x_bounds": ([0, 0], 1.0)}, r"lower end of x .*shape \(5,\)"),
+        ({"u_scatter": (1.0, -1.0)}, "scatter of u cross at element 0"),
+        ({"terminal_cost": pose}, r"terminal_cost returned shape \(2,\).*scalar.*residual"),
+        ({"running_cost": effort}, r"running_cost returned shape \(2,\).*scalar"),
+        ({"terminal_cost": fails}, "terminal_cost failed .*KeyError: 'no such sensor'"),
+        ({"running_residual": fails}, "running_residual failed .*no such sensor"),
+        ({"running_cost": branches}, "running_cost failed.*Python branches"),
+        ({"terminal_cost": lambda data: None}, "terminal_cost returned None"),
+        ({"terminal_cost": lambda data: 1}, "terminal_cost returned .*floats"),
+        ({"terminal_cost": lambda data, u: 1.0}, "terminal_cost failed .*TypeError"),
+        ({"running_residual": None}, "arm has no cost"),
+        ({"goal": lambda data: data.qpos > 0}, r"goal returned shape \(2,\)"),
+        ({"goal": lambda data: data.qqpos > 0}, "goal failed at x = .*AttributeError.*MjData"),
+    ],
+)
+def test_arguments_that_are_refused(arguments, words):
+    with pytest.raises(DraxError, match=words):
+        problem(arm(), **arguments)
+
+
+def test_another_initial_state_is_checked_too():
+    task = problem(arm())
+    moved = task.with_x_init([0.1, 0, 0, 0, 0])
+    np.testing.assert_allclose(moved.x_init, [0.1, 0, 0, 0, 0])
+    with pytest.raises(DraxError, match="outside the bounds"):
+        task.with_x_init([9.0, 0, 0, 0, 0])
+    with pytest.raises(DraxError, match="x_init"):
+        task.with_x_init([0.1])
