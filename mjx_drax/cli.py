@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 from mjx_drax.errors import DraxError
 
 if TYPE_CHECKING:
+    from tqdm import tqdm
+
     from mjx_drax.langevin import Info, Langevin
     from mjx_drax.problem import Problem
     from mjx_drax.solution import Solution
@@ -241,53 +243,48 @@ def _cache_compilations() -> None:
 class _Bar:
     """A progress bar with the two numbers that matter: best feasible cost, share feasible."""
 
-    def __enter__(self) -> _Bar:
-        from tqdm import tqdm
-
-        self._bar = tqdm(total=None, unit="it", file=sys.stderr, bar_format=self._FORMAT)
-        return self
-
     _FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+    def __init__(self) -> None:
+        self._bar: tqdm | None = None
+
+    def __enter__(self) -> _Bar:
+        return self
 
     def __call__(self, done: int, total: int, info: Info) -> None:
         import numpy as np
+        from tqdm import tqdm
 
         from mjx_drax.langevin import FEASIBLE
 
+        if self._bar is None:  # only now: before, it would count compilation as progress
+            self._bar = tqdm(total=total, initial=done, file=sys.stderr, bar_format=self._FORMAT)
         feasible = np.asarray(info.max_defect) < FEASIBLE
         best = np.asarray(info.cost)[feasible].min(initial=np.inf)
-        self._bar.total = total
         self._bar.set_postfix_str(f"best cost {best:.4g}, feasible {feasible.mean():.0%}", False)
         self._bar.update(done - self._bar.n)
 
     def __exit__(self, *_: object) -> None:
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()
 
 
 def _report(solution: Solution) -> None:
     """The summary for a person."""
-    best, certificate = solution.best_chain, solution.certificate
-    status = solution.status
+    from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK
+
+    best, status = solution.best_chain, solution.status
     counts = ", ".join(f"{status.count(name)} {name}" for name in sorted(set(status)))
     rate = f"{solution.success_rate:.1%} succeed when replayed"
-    say(f"chains       {solution.chains}: {counts}; {rate}")
+    say(f"chains         {solution.chains}: {counts}; {rate}")
     say(
-        f"best         cost {solution.cost[best]:.5g}, max|h| {solution.max_defect[best]:.1e}, "
+        f"best           cost {solution.cost[best]:.5g}, max|h| {solution.max_defect[best]:.1e}, "
         f"bound violation {solution.max_violation[best]:.1e}"
     )
-    for label, run in (
-        ("open loop", certificate.open_loop),
-        ("feedback", certificate.feedback),
-    ):
-        verdict = "reaches the goal" if run["success"] else "misses the goal"
-        if solution.problem.goal is None:
-            verdict = "follows the plan" if run["success"] else "leaves the plan"
-        say(
-            f"{label:12} {verdict}, ends {run['final_deviation']:.1e} off the plan "
-            f"(at most {run['max_deviation']:.1e}), cost {run['cost']:.5g}"
-        )
-    say(f"engine       {certificate.engine}")
-    say(f"time         compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s")
+    for mode in (OPEN_LOOP, WITH_FEEDBACK):
+        say(f"{mode:14} {solution.outcome(mode)}")
+    say(f"engine         {solution.certificate.engine}")
+    say(f"time           compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s")
     say("CERTIFIED" if solution.certified else "NOT CERTIFIED: " + _advice(solution))
 
 

@@ -22,7 +22,6 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE
-from mjx_drax.rendering import outcome, replay_mode
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,7 +58,7 @@ def plot_solution(
     panels: list[Callable[[Axes], None]] = []
     if draw is not None:
         panels.append(partial(_draw_scene, solution=solution, draw=draw))
-    times, mode = solution.problem.times, replay_mode(solution)
+    times, mode = solution.problem.times, solution.replay_mode
     panels += [partial(curves.draw, times=times, mode=mode) for curves in _motion(solution)]
     panels += [
         partial(_draw_defects, solution=solution),
@@ -98,8 +97,8 @@ def _title(solution: Solution) -> str:
             f"cost {solution.cost[chain]:.4g},  max|h| {solution.max_defect[chain]:.1g},  "
             f"bound violation {solution.max_violation[chain]:.1g},  "
             f"{solution.success_rate:.0%} of {solution.chains} chains succeed",
-            f"{certificate.engine}, open loop: {outcome(solution, certificate.open_loop)}",
-            f"{certificate.engine}, with feedback: {outcome(solution, certificate.feedback)}",
+            f"{certificate.engine}, open loop: {solution.outcome('open loop')}",
+            f"{certificate.engine}, with feedback: {solution.outcome('with feedback')}",
         ]
     )
 

@@ -18,7 +18,7 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -97,29 +97,11 @@ def render(
     return _write_video(path, frames, fps, size)
 
 
-def replay_mode(solution: Solution) -> str:
-    """How `solution.replayed` came about."""
-    success = solution.certificate.open_loop["success"]
-    return "open loop" if success else "with feedback"
-
-
 def verdict(solution: Solution) -> str:
     """What the replay that is shown came to, in one line."""
-    certificate, mode = solution.certificate, replay_mode(solution)
     has_model = hasattr(solution.problem.dynamics, "mj_model")
     engine = "MuJoCo C replay" if has_model else "float64 rollout"
-    replay = certificate.open_loop if mode == "open loop" else certificate.feedback
-    return f"{engine}, {mode}: {outcome(solution, replay)}"
-
-
-def outcome(solution: Solution, replay: Mapping[str, Any]) -> str:
-    """One replay of a certificate in words."""
-    if not np.isfinite(replay["max_deviation"]):
-        return "diverges"
-    words = ("misses the goal", "reaches the goal")
-    if solution.problem.goal is None:
-        words = ("leaves the plan", "keeps to the plan")
-    return f"{words[replay['success']]}, {replay['max_deviation']:.1e} off plan"
+    return f"{engine}, {solution.replay_mode}: {solution.outcome(solution.replay_mode)}"
 
 
 def _overlay(solution: Solution) -> list[str]:
@@ -127,6 +109,8 @@ def _overlay(solution: Solution) -> list[str]:
     chain = solution.best_chain
     defect = float(solution.max_defect[chain])
     numbers = f"cost {float(solution.cost[chain]):.3g}   max|h| {defect:.1g}"
+    violation = float(solution.max_violation[chain])
+    numbers += f"   bound violation {violation:.1g}"
     lines = [solution.problem.name, numbers, verdict(solution), "t = {time}"]
     if not solution.certified:
         breach = "the plan breaks the dynamics"

@@ -34,6 +34,7 @@ TRACKED = 1e-2
 CHUNK = 10
 """Iterations between two reports, records of the history, and chances to interrupt."""
 
+OPEN_LOOP, WITH_FEEDBACK = "open loop", "with feedback"
 CONVERGED, INFEASIBLE, DIVERGED = "converged", "infeasible", "diverged"
 
 Progress = Callable[[int, int, Info], None]
@@ -170,14 +171,26 @@ class Solution:
         return bool(self.feasible[self.best_chain]) and self.certificate.success
 
     @property
-    def replayed(self) -> tuple[np.ndarray, np.ndarray]:
-        """States (K+1, nx) and controls (K, nu) of the best chain as replayed.
+    def replay_mode(self) -> str:
+        """Which replay speaks for the best chain: open loop where that succeeds."""
+        return OPEN_LOOP if self.certificate.open_loop["success"] else WITH_FEEDBACK
 
-        Open loop where that succeeds, with feedback otherwise.
-        """
-        chain = self.best_chain
-        replays = self.open_loop if self.open_loop.success[chain] else self.feedback
-        return replays.states[chain], replays.controls[chain]
+    def outcome(self, mode: str) -> str:
+        """What the best chain's replay in a mode (`OPEN_LOOP`, `WITH_FEEDBACK`) came to, in words."""
+        certificate = self.certificate
+        replay = certificate.open_loop if mode == OPEN_LOOP else certificate.feedback
+        if not np.isfinite(replay["max_deviation"]):
+            return "diverges"
+        words = ("misses the goal", "reaches the goal")
+        if self.problem.goal is None:
+            words = ("leaves the plan", "keeps to the plan")
+        return f"{words[replay['success']]}, {replay['max_deviation']:.1e} off plan"
+
+    @property
+    def replayed(self) -> tuple[np.ndarray, np.ndarray]:
+        """States (K+1, nx) and controls (K, nu) of the best chain, replayed in `replay_mode`."""
+        replays = self.open_loop if self.replay_mode == OPEN_LOOP else self.feedback
+        return replays.states[self.best_chain], replays.controls[self.best_chain]
 
 
 def solve(

@@ -1,6 +1,6 @@
 """The Langevin flow on an equality-constrained quadratic program, whose answer is known.
 
-    min 1/2 z'Hz + g'z   s.t.   h(z) = Jz + h0 = 0,     z = [x_1..x_K, u_0..u_{K-1}]
+min 1/2 z'Hz + g'z   s.t.   h(z) = Jz + h0 = 0,     z = [x_1..x_K, u_0..u_{K-1}]
 """
 
 from dataclasses import replace
@@ -150,7 +150,9 @@ def test_the_noise_of_a_step_has_covariance_2_alpha_sigma2_over_M(preconditioner
     moved = z(advance(noisy, problem, state, 0, 1)) - z(advance(quiet, problem, state, 0, 1))
     white = moved @ np.linalg.cholesky(M) / (sigma * np.sqrt(2 * alpha))
     np.testing.assert_allclose(white.mean(0), 0, atol=6 / chains**0.5)
-    np.testing.assert_allclose(white.T @ white / chains, np.eye(len(M)), atol=6 * (2 / chains) ** 0.5)
+    np.testing.assert_allclose(
+        white.T @ white / chains, np.eye(len(M)), atol=6 * (2 / chains) ** 0.5
+    )
 
 
 def test_the_tail_has_no_noise():
@@ -162,7 +164,9 @@ def test_the_tail_has_no_noise():
 
 
 def identical(one, other):
-    same = jax.tree.map(lambda a, b: np.array_equal(a, b, equal_nan=True), *map(numbers, (one, other)))
+    same = jax.tree.map(
+        lambda a, b: np.array_equal(a, b, equal_nan=True), *map(numbers, (one, other))
+    )
     return all(jax.tree.leaves(same))
 
 

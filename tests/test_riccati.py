@@ -72,9 +72,7 @@ def test_float32_needs_no_digits_for_the_penalty():
     model, cost, multipliers = drawn(2)
     H, g, J = dense(model, cost)
     mu = 1e6  # M has a condition number far beyond 1 / eps
-    d = -np.linalg.solve(
-        H + mu * J.T @ J, g + J.T @ (multipliers.ravel() + mu * model.h.ravel())
-    )
+    d = -np.linalg.solve(H + mu * J.T @ J, g + J.T @ (multipliers.ravel() + mu * model.h.ravel()))
     single = jax.tree.map(np.float32, (model, cost, multipliers, mu))
     dx, du, *_ = newton(*single, KEY)
     assert dx.dtype == np.float32

@@ -1,0 +1,135 @@
+"""The command line, in this process; the heavy commands with the smallest sizes that still work."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mjx_drax import tasks
+from mjx_drax.cli import main
+
+COST = """
+import jax.numpy as jnp
+
+horizon = 0.5
+
+def terminal_residual(data):
+    return jnp.concatenate([20.0 * (data.qpos - 0.2), 5.0 * data.qvel])
+
+def running_residual(data, u):
+    return 0.1 * u
+
+def goal(data):
+    return abs(data.qpos[0] - 0.2) < 0.01 and abs(data.qvel[0]) < 0.1
+"""
+
+SLIDER = """
+<mujoco model="slider">
+  <option timestep="0.01" integrator="Euler"><flag contact="disable"/></option>
+  <worldbody><body>
+    <joint name="slide" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+    <geom size="0.05" mass="1"/>
+  </body></worldbody>
+  <actuator><motor joint="slide" gear="10" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    (tmp_path / "slider.xml").write_text(SLIDER)
+    (tmp_path / "mycost.py").write_text(COST)
+    return tmp_path
+
+
+def error_of(capsys, *arguments):
+    assert main(arguments) == 2
+    return capsys.readouterr().err
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys\nfrom mjx_drax.cli import main\n"
+        "try:\n    main(['solve', '--help'])\nexcept SystemExit:\n    pass\n"
+        "main(['list'])\n"
+        "assert not {'jax', 'mujoco', 'numpy', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_list_names_every_task(capsys):
+    assert main(["list"]) == 0
+    out = capsys.readouterr().out
+    for name in ("pendulum", "bug_trap", "pendulum_swingup", "cartpole_swingup", "acrobot_swingup"):
+        assert name in out
+        assert name in tasks.names()
+
+
+def test_own_model_is_certified_and_written(own, capsys):
+    status = main(
+        ["solve", "--model", str(own / "slider.xml"), "--cost", str(own / "mycost.py")]
+        + ["--chains", "4", "--iterations", "30", "--seed", "3", "--out", str(own / "out")]
+    )
+    assert status == 0
+    out = capsys.readouterr().out
+    assert "CERTIFIED" in out
+    assert "NOT CERTIFIED" not in out
+    result = json.loads((own / "out" / "result.json").read_text())
+    assert result["task"] == "slider"
+    assert (result["chains"], result["seed"], result["iterations"]) == (4, 3, 48)
+    assert result["max_defect"] < 1e-3
+    assert result["max_bound_violation"] == 0
+    assert result["success_rate"] == 1.0
+    assert "MuJoCo" in result["certificate"]["engine"]
+    for replay in ("open_loop", "feedback"):
+        assert set(result["certificate"][replay]) == {
+            "max_deviation",
+            "final_deviation",
+            "cost",
+            "success",
+        }
+    arrays = np.load(own / "out" / "result.npz")
+    assert arrays["times"].shape == (26,)
+    assert arrays["states"].shape == (26, 2)
+    assert arrays["gains"].shape == (25, 1, 2)
+    assert arrays["chain_cost"].shape == (4,)
+    np.testing.assert_allclose(arrays["replayed_states"][-1, 0], 0.2, atol=0.01)
+    assert (own / "out" / "video.mp4").stat().st_size > 1000
+    assert (own / "out" / "plot.png").stat().st_size > 1000
+
+
+def test_status_is_1_when_not_certified(tmp_path, capsys):
+    status = main(
+        ["solve", "pendulum", "--horizon", "0.5", "--chains", "2", "--iterations", "5"]
+        + ["--out", str(tmp_path), "--no-video"]
+    )
+    assert status == 1
+    assert "NOT CERTIFIED" in capsys.readouterr().out
+    assert not json.loads((tmp_path / "result.json").read_text())["certified"]
+    assert not (tmp_path / "video.mp4").exists()
+
+
+def test_errors_name_cause_and_fix(own, capsys):
+    model, cost = str(own / "slider.xml"), str(own / "mycost.py")
+    assert "pendulum_swingup" in error_of(capsys, "solve", "pendulumm")
+    assert "--cost" in error_of(capsys, "solve", "--model", model)
+    assert "choose one" in error_of(capsys, "solve", "pendulum", "--model", model)
+    assert "no.xml" in error_of(capsys, "solve", "--model", "no.xml", "--cost", cost)
+    assert "no.py" in error_of(capsys, "solve", "--model", model, "--cost", "no.py")
+    (own / "mycost.py").write_text("1 / 0")
+    assert "ZeroDivisionError" in error_of(capsys, "solve", "--model", model, "--cost", cost)
+    (own / "mycost.py").write_text("def terminal_cost(data):\n    return data.qpos\nhorizon = 1")
+    assert "scalar" in error_of(capsys, "solve", "--model", model, "--cost", cost)
+    (own / "mycost.py").write_text("def terminal_cost(data):\n    return data.qpos[0]")
+    assert "--horizon" in error_of(capsys, "solve", "--model", model, "--cost", cost)
+    (own / "file").write_text("")
+    assert "--out" in error_of(capsys, "solve", "pendulum", "--out", str(own / "file"))
+
+
+def test_benchmark_prints_and_saves_rows(tmp_path, capsys):
+    main(["benchmark", "pendulum", "--seeds", "0", "--chains", "4", "--out", str(tmp_path)])
+    rows = json.loads((tmp_path / "benchmark.json").read_text())["rows"]
+    assert [(row["problem"], row["chains"]) for row in rows] == [("pendulum", 4)]
+    assert f"{rows[0]['success_rate']:.1%}" in capsys.readouterr().out

@@ -1,0 +1,372 @@
+"""Solving, and what is claimed about the result: certificate, status, feedback, interruptions."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import Constant, DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf
+from mjx_drax import solution as solving
+from mjx_drax.langevin import advance, evaluate
+from mjx_drax.solution import CHUNK, TRACKED, _replays, solve
+from mjx_drax.tasks import load
+
+OPTIMUM = 0.031774  # of the pendulum: 600 of 600 IPOPT multistarts agree
+DT, K = 0.2, 10
+CHAINS = 24
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    task = load("pendulum")
+    return solve(task.make(), chains=CHAINS, solver=task.SOLVER)
+
+
+def reach(**rest):
+    """A double integrator that is to come to rest at 1."""
+    arguments = {
+        "x_init": [0.0, 0.0],
+        "nu": 1,
+        "dt": DT,
+        "horizon": K * DT,
+        "running_residual": effort,
+        "terminal_residual": miss,
+        "u_bounds": (-2.0, 2.0),
+        "name": "reach",
+        **rest,
+    }
+    return from_function(arguments.pop("f", double_integrator), **arguments)
+
+
+def double_integrator(x, u):
+    return x + DT * jnp.array([x[1], u[0]])
+
+
+def effort(x, u):
+    return 0.1 * u
+
+
+def miss(x):
+    return 10.0 * (x - jnp.array([1.0, 0.0]))
+
+
+def near(x):
+    return abs(x[0] - 1) < 0.1
+
+
+QUICK = Langevin(iterations=20, tail=20)
+
+
+def rollout(problem, u):
+    """States (chains, K + 1, nx) of f under controls (chains, K, nu), in numpy's float64."""
+    x = np.broadcast_to(problem.x_init, (len(u), problem.dynamics.nx)).astype(float)
+    states = [x]
+    for k in range(u.shape[1]):
+        x = x + DT * np.stack([x[:, 1], u[:, k, 0]], axis=1)
+        states.append(x)
+    return np.stack(states, axis=1)
+
+
+# The pendulum of the paper.
+
+
+def test_pendulum_chains_reach_the_known_optimum(pendulum):
+    assert pendulum.success_rate > 0.9
+    assert pendulum.certified
+    assert pendulum.cost[pendulum.best_chain] == pytest.approx(OPTIMUM, rel=0.01)
+    feasible_costs = pendulum.cost[pendulum.feasible]
+    assert feasible_costs.min() > 0.99 * OPTIMUM  # nothing feasible undercuts it
+    assert pendulum.max_defect[pendulum.best_chain] < 1e-4
+    assert (pendulum.max_violation == 0).all()
+
+
+def test_certificate_tells_what_the_best_chain_did(pendulum):
+    certificate, c = pendulum.certificate, pendulum.best_chain
+    assert certificate.success
+    assert "float64" in certificate.engine
+    for label in ("open_loop", "feedback"):
+        told, replays = getattr(certificate, label), getattr(pendulum, label)
+        assert set(told) == {"max_deviation", "final_deviation", "cost", "success"}
+        assert told["success"] is True
+        assert told["cost"] == pytest.approx(OPTIMUM, rel=0.01)
+        assert 0 <= told["final_deviation"] <= told["max_deviation"] == replays.max_deviation[c]
+        assert replays.states.dtype == np.float64
+    states, controls = pendulum.replayed
+    np.testing.assert_array_equal(states, pendulum.open_loop.states[c])
+    np.testing.assert_array_equal(controls, pendulum.open_loop.controls[c])
+    assert np.abs(controls).max() <= 1
+
+
+def test_solution_keeps_status_and_history(pendulum):
+    total = pendulum.solver.iterations + pendulum.solver.tail
+    assert pendulum.iterations == total
+    assert pendulum.status == ["converged" if f else "infeasible" for f in pendulum.feasible]
+    assert (pendulum.died_at == -1).all()
+    assert ((pendulum.converged_at > 0) == pendulum.feasible).all()
+    history = pendulum.history
+    np.testing.assert_array_equal(history["iteration"], np.arange(0, total + 1, CHUNK))
+    np.testing.assert_array_equal(history["cost"][-1], pendulum.cost)
+    np.testing.assert_array_equal(history["max_defect"][-1], pendulum.max_defect)
+    for c in np.flatnonzero(pendulum.feasible):
+        since = history["iteration"] >= pendulum.converged_at[c]
+        assert (history["max_defect"][since, c] < 1e-3).all()
+        assert history["max_defect"][~since, c][-1] >= 1e-3
+
+
+def test_feedback_tracks_where_open_loop_drifts(pendulum):
+    problem, good = pendulum.problem, pendulum.feasible
+    plan = pendulum.open_loop.states[good]
+    push = 0.05 * np.random.default_rng(0).normal(size=(good.sum(), problem.horizon, 1))
+    u, free = pendulum.trajectories.u[good] + push, (-np.inf, np.inf)
+    gains = pendulum.gains[good].astype(float)
+    drift, tracked = (
+        np.abs(problem.dynamics.replay(plan, u, K, free)[0] - plan).max(axis=(1, 2))
+        for K in (0 * gains, gains)
+    )
+    assert np.median(tracked) < 0.2 * np.median(drift)
+
+
+# Replays.
+
+
+def test_a_plan_that_was_rolled_out_deviates_by_nothing():
+    problem = reach()
+    u = np.random.default_rng(0).uniform(-1, 1, (3, K, 1)).astype(np.float32)
+    plan = rollout(problem, u.astype(float))
+    replays = _replays(problem, Trajectory(plan[:, 1:], u), np.ones((3, K, 1, 2)))
+    np.testing.assert_allclose(replays.states, plan, atol=1e-6)
+    np.testing.assert_allclose(replays.controls, u, atol=1e-6)
+    assert replays.max_deviation.max() < 1e-6
+    assert replays.success.all()  # without a goal: it ends where it was planned to
+    trajectory = Trajectory(plan[:, 1:].astype(np.float32), u)
+    np.testing.assert_allclose(replays.cost, evaluate(problem, trajectory).cost, rtol=1e-5)
+
+
+def test_wrong_controls_are_no_success():
+    problem = reach()
+    u = np.full((2, K, 1), 0.5, np.float32)
+    plan = rollout(problem, u.astype(float))
+    u[1, 0] += 2 * TRACKED / (DT * K * DT)
+    replays = _replays(problem, Trajectory(plan[:, 1:], u), np.zeros((2, K, 1, 2)))
+    np.testing.assert_array_equal(replays.success, [True, False])
+    expected = 2 * TRACKED / (K * DT) * np.array([(K - 1) * DT, 1.0]).max()
+    assert replays.final_deviation[1] == pytest.approx(expected, rel=1e-3)
+
+
+def test_with_a_goal_success_is_where_the_replay_ends_not_where_the_plan_does():
+    problem = reach(goal=near)
+    still, arrived = np.zeros((1, K, 1), np.float32), np.tile([1.0, 0.0], (1, K, 1))
+    assert not _replays(problem, Trajectory(arrived, still), np.zeros((1, K, 1, 2))).success[0]
+
+
+def test_replays_respect_the_control_bounds():
+    problem = reach(u_bounds=([-1.0], [0.5]))
+    u, plan = np.array([[[9.0], [-9.0]] * (K // 2)]), np.zeros((1, K, 2))
+    replays = _replays(problem, Trajectory(plan, u), np.full((1, K, 1, 2), 3.0))
+    assert replays.controls.min() >= -1
+    assert replays.controls.max() <= 0.5
+
+
+def test_a_replay_that_turns_nan_is_no_success():
+    problem = reach(goal=lambda x: True)
+    u = np.full((1, K, 1), np.nan)
+    replays = _replays(problem, Trajectory(np.zeros((1, K, 2)), u), np.zeros((1, K, 1, 2)))
+    assert not replays.success[0]
+    assert replays.max_deviation[0] == np.inf
+
+
+@pytest.mark.parametrize("control", [np.nan, 1e30])
+def test_what_blows_up_in_the_c_engine_is_no_success(control, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes MUJOCO_LOG.TXT
+    problem = from_mjcf(
+        """<mujoco><worldbody><body><joint name="j"/><geom size="0.1" pos="0 0 -1"/></body>
+        </worldbody><actuator><motor joint="j"/></actuator></mujoco>""",
+        horizon=0.1,
+        running_residual=lambda data, u: u,
+        goal=lambda data: abs(data.qpos[0]) < 0.1,  # as MuJoCo's automatic reset leaves it
+    )
+    K = problem.horizon
+    u, plan = np.full((1, K, 1), control), np.zeros((1, K, 2))
+    states, _ = problem.dynamics.replay(
+        np.zeros((1, K + 1, 2)), u, np.zeros((1, K, 1, 2)), (np.array(-np.inf), np.array(np.inf))
+    )
+    assert not np.isfinite(states[0, -1]).all()
+    assert not _replays(problem, Trajectory(plan, u), np.zeros((1, K, 1, 2))).success[0]
+
+
+# Solves.
+
+
+@pytest.mark.parametrize("preconditioner", [None, Identity()])
+def test_gains_come_with_every_preconditioner(preconditioner):
+    solver = (
+        replace(QUICK, preconditioner=preconditioner, step_size=1e-3) if preconditioner else QUICK
+    )
+    solution = solve(reach(), chains=2, solver=solver)
+    assert solution.gains.shape == (2, K, 1, 2)
+    assert (solution.gains[:, :-1] < 0).all()  # pushes back, at every knot that still matters
+
+
+def test_same_seed_same_solution():
+    first, again, other = (solve(reach(), chains=3, seed=s, solver=QUICK) for s in (0, 0, 1))
+    np.testing.assert_array_equal(first.trajectories.x, again.trajectories.x)
+    np.testing.assert_array_equal(first.cost, again.cost)
+    assert not np.array_equal(first.trajectories.x, other.trajectories.x)
+    assert first.certified
+
+
+def test_an_infeasible_answer_is_not_certified_however_cheap():
+    once = Langevin(iterations=1, tail=0, noise=Constant(0.0))
+    wall = reach(u_bounds=(-1e-3, 1e-3), goal=near)  # too weak to get there
+    solution = solve(wall, chains=2, solver=once)
+    assert not solution.certified
+    assert solution.success_rate == 0
+    assert set(solution.status) == {"infeasible"}
+
+
+def test_a_diverged_chain_is_named_and_never_best():
+    def guess(key):
+        x = jax.random.uniform(key, (K, 2))
+        return Trajectory(jnp.where(x[0, 0] < 0.5, jnp.nan, x), jnp.zeros((K, 1)))
+
+    solution = solve(reach(guess=guess, goal=near), chains=8, solver=QUICK)
+    diverged = np.array(solution.status) == "diverged"
+    assert 0 < diverged.sum() < 8
+    np.testing.assert_array_equal(diverged, solution.died_at == 0)
+    assert not diverged[solution.best_chain]
+    assert not solution.success[diverged].any()
+    assert solution.success[~diverged].all()
+
+
+def test_ctrl_c_between_reports_keeps_what_there_is():
+    seen = []
+
+    def progress(done, total, info):
+        seen.append((done, total))
+        if done == 2 * CHUNK:
+            raise KeyboardInterrupt
+
+    solution = solve(reach(), chains=3, solver=QUICK, progress=progress)
+    assert seen == [(CHUNK, 40), (2 * CHUNK, 40)]
+    assert solution.iterations == 2 * CHUNK
+    np.testing.assert_array_equal(solution.history["iteration"], [0, CHUNK, 2 * CHUNK])
+    short = solve(reach(), chains=3, solver=QUICK, progress=progress)
+    np.testing.assert_array_equal(short.trajectories.x, solution.trajectories.x)
+
+
+@pytest.mark.parametrize("call", [2, 3])
+def test_ctrl_c_during_an_iteration_reports_the_numbers_of_the_chains_it_returns(call, monkeypatch):
+    calls = []
+
+    def interrupted(problem, trajectory):
+        calls.append(None)
+        if len(calls) == call:
+            raise KeyboardInterrupt
+        return evaluate(problem, trajectory)
+
+    monkeypatch.setattr(solving, "evaluate", interrupted)
+    solution = solve(reach(), chains=3, solver=QUICK)
+    info = evaluate(solution.problem, solution.trajectories)
+    assert solution.iterations == (call - 2) * CHUNK
+    np.testing.assert_allclose(solution.max_defect, info.max_defect, rtol=1e-6)
+    np.testing.assert_allclose(solution.cost, info.cost, rtol=1e-6)
+
+
+def knots(*lead):
+    return Trajectory(np.full((*lead, K, 2), 0.3), np.full((*lead, K, 1), 0.2))
+
+
+def test_guesses_are_one_for_all_or_one_for_each():
+    still = Langevin(iterations=1, tail=0, step_size=0.0)
+    each = jax.tree.map(lambda a: a * np.arange(1, 4)[:, None, None], knots(3))
+    for guess, expected in ((knots(), knots(3)), (each, each)):
+        solution = solve(reach(), chains=3, solver=still, guess=guess)
+        for seen, wanted in zip(
+            *map(jax.tree.leaves, (solution.trajectories, expected)), strict=True
+        ):
+            np.testing.assert_allclose(seen, wanted, rtol=1e-6)
+
+
+@pytest.fixture
+def no_compilation(monkeypatch):
+    """What is refused must be refused before the long compilation."""
+
+    def fail(*arguments):
+        pytest.fail("the solver was compiled")
+
+    monkeypatch.setattr(solving, "advance", fail)
+
+
+@pytest.mark.parametrize(
+    ("guess", "words"),
+    [
+        (knots(2), r"guess.x has shape \(2, 10, 2\): give \(10, 2\), or \(3, 10, 2\)"),
+        (replace(knots(), u=np.zeros((K, 2))), r"guess.u has shape \(10, 2\): give \(10, 1\)"),
+        (replace(knots(), x=np.zeros((K + 1, 2))), r"guess.x has shape \(11, 2\)"),
+        (replace(knots(), u=np.full((K, 1), np.nan)), "guess.u holds NaN"),
+    ],
+)
+def test_guesses_that_are_refused(guess, words, no_compilation):
+    with pytest.raises(DraxError, match=words):
+        solve(reach(), chains=3, solver=QUICK, guess=guess)
+
+
+def test_a_cost_or_dynamics_that_are_nan_everywhere_are_refused(no_compilation):
+    for label, part in (
+        ("cost", {"terminal_cost": lambda x: jnp.log(-1.0 - x[0] ** 2)}),
+        ("dynamics", {"f": lambda x, u: x / 0.0 - x / 0.0}),
+    ):
+        with pytest.raises(DraxError, match=f"the {label} of reach is nan at the initial knots"):
+            solve(reach(**part), chains=3, solver=QUICK)
+
+
+def test_a_cost_that_is_nan_for_some_chains_only_is_a_matter_of_those_chains():
+    guess = jax.tree.map(lambda a: a * np.array([1, -1, 2])[:, None, None], knots(3))
+    partly = reach(terminal_cost=lambda x: 1e-3 * jnp.sqrt(x[0]))
+    solution = solve(partly, chains=3, solver=QUICK, guess=guess)
+    assert [status == "diverged" for status in solution.status] == [False, True, False]
+
+
+def test_counts_that_are_refused(no_compilation):
+    with pytest.raises(DraxError, match="chains is 0"):
+        solve(reach(), chains=0)
+    with pytest.raises(DraxError, match="iterations"):
+        solve(reach(), chains=1, solver=Langevin(iterations=0, tail=0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"u_bounds": ([-1.0, -1.0], [1.0, 1.0])}, r"lower end of u.*\(1,\)"),
+        ({"x_bounds": ([-1.0] * 3, 1.0)}, r"lower end of x.*\(2,\)"),
+        ({"x_bounds": (-np.ones((K + 3, 2)), 9.0)}, "lower end of x|bounds of x"),
+        ({"f": lambda x, u: x[:1]}, r"dynamics f\(x, u\) returned shape \(1,\)"),
+        ({"f": lambda x, u: x @ u}, "dynamics .* failed"),
+        ({"nu": 0}, "reach has 0 controls"),
+        ({"dt": 0.0}, "dt is 0.0"),
+        ({"x_init": [[0.0, 0.0]]}, "x_init"),
+        ({"x_bounds": (0.5, 1.0)}, "x_init .*outside the bounds of x by 0.5"),
+        ({"terminal_cost": lambda x: x}, "terminal_cost returned shape"),
+        ({"goal": lambda x: x > 0}, r"goal returned shape \(2,\)"),
+        ({"goal": lambda x: x.qpos}, "goal failed"),
+        ({"running_residual": None, "terminal_residual": None}, "reach has no cost"),
+    ],
+)
+def test_problems_that_are_refused(arguments, words):
+    with pytest.raises(DraxError, match=words):
+        reach(**arguments)
+
+
+@pytest.mark.slow
+def test_cartpole_swings_up_from_mjcf():
+    task, before = load("cartpole_swingup"), advance._cache_size()
+    solution = solve(task.make(), chains=4, solver=task.SOLVER)
+    assert advance._cache_size() - before == 1
+    assert solution.success_rate > 0.5
+    assert solution.certified
+    assert f"MuJoCo {mujoco.__version__} C engine" in solution.certificate.engine
+    assert solution.certificate.feedback["max_deviation"] < 0.01
+    assert solution.cost[solution.best_chain] < 0.3
