@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mjx_drax.dynamics import Dynamics
-    from mjx_drax.solution import Solution
+    from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
 
     Draw = Callable[[Axes, np.ndarray], None]
 
@@ -97,8 +97,10 @@ def _title(solution: Solution) -> str:
             f"cost {solution.cost[chain]:.4g},  max|h| {solution.max_defect[chain]:.1g},  "
             f"bound violation {solution.max_violation[chain]:.1g},  "
             f"{solution.success_rate:.0%} of {solution.chains} chains succeed",
-            f"{certificate.engine}, open loop: {solution.outcome('open loop')}",
-            f"{certificate.engine}, with feedback: {solution.outcome('with feedback')}",
+            *(
+                f"{certificate.engine}, {mode}: {solution.outcome(mode)}"
+                for mode in (OPEN_LOOP, WITH_FEEDBACK)
+            ),
         ]
     )
 

@@ -176,7 +176,7 @@ class Solution:
         return OPEN_LOOP if self.certificate.open_loop["success"] else WITH_FEEDBACK
 
     def outcome(self, mode: str) -> str:
-        """What the best chain's replay in a mode (`OPEN_LOOP`, `WITH_FEEDBACK`) came to, in words."""
+        """What the best chain's replay in that mode came to, in words."""
         certificate = self.certificate
         replay = certificate.open_loop if mode == OPEN_LOOP else certificate.feedback
         if not np.isfinite(replay["max_deviation"]):

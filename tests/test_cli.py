@@ -69,8 +69,8 @@ def test_list_names_every_task(capsys):
 
 def test_own_model_is_certified_and_written(own, capsys):
     status = main(
-        ["solve", "--model", str(own / "slider.xml"), "--cost", str(own / "mycost.py")]
-        + ["--chains", "4", "--iterations", "30", "--seed", "3", "--out", str(own / "out")]
+        f"solve --model {own}/slider.xml --cost {own}/mycost.py --chains 4 --iterations 30 "
+        f"--seed 3 --out {own}/out".split()
     )
     assert status == 0
     out = capsys.readouterr().out
@@ -101,10 +101,8 @@ def test_own_model_is_certified_and_written(own, capsys):
 
 
 def test_status_is_1_when_not_certified(tmp_path, capsys):
-    status = main(
-        ["solve", "pendulum", "--horizon", "0.5", "--chains", "2", "--iterations", "5"]
-        + ["--out", str(tmp_path), "--no-video"]
-    )
+    short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video"
+    status = main([*short.split(), "--out", str(tmp_path)])
     assert status == 1
     assert "NOT CERTIFIED" in capsys.readouterr().out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]

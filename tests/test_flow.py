@@ -242,7 +242,14 @@ def test_numbers_change_without_recompiling():
         problem = program(x_bounds=(-3.0, 3.0), u_bounds=(-1.0, 1.0), **rest)
         return replace(problem, running=replace(problem.running, residual=Partial(counted, weight)))
 
-    base = Langevin(iterations=6, tail=3, noise=Geometric(10.0, 0.1))
+    base = Langevin(
+        iterations=6,
+        tail=3,
+        noise=Geometric(10.0, 0.1),
+        penalty=Geometric(100.0, 1000.0),
+        damping=Geometric(0.1, 1e-3),
+        barrier_weight=Geometric(0.1, 1e-3, 1e-6),
+    )
     cases = [
         (base, make()),
         (base, make(x_init=X0 + 1)),

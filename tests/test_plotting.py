@@ -15,8 +15,7 @@ from mjx_drax import plotting
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import Langevin
 from mjx_drax.plotting import plot_solution
-from mjx_drax.rendering import outcome
-from mjx_drax.solution import Solution, solve
+from mjx_drax.solution import WITH_FEEDBACK, Solution, solve
 from mjx_drax.tasks import load
 
 
@@ -109,7 +108,7 @@ def test_diverged_chains_and_replays(pendulum: Solution, kind: str, tmp_path: Pa
     )
     bad = replace(bad, open_loop=lost, feedback=lost)
     assert not bad.certified
-    assert outcome(bad, bad.certificate.feedback) == "diverges"
+    assert bad.outcome(WITH_FEEDBACK) == "diverges"
     assert "NOT CERTIFIED" in plotting._title(bad)
     assert _size(plot_solution(bad, tmp_path / "bad.png")) == (1200, 1290)
 
