@@ -38,7 +38,7 @@ from mjx_drax.schedules import Constant, Geometric
 FEASIBLE = 1e-3
 """Largest defect max|h| that counts as feasible."""
 
-LADDER = tuple(0.5**i for i in range(9))
+LADDER = (*(0.5**i for i in range(9)), 0.0)
 """Step sizes that the tail chooses from."""
 
 
@@ -174,6 +174,8 @@ class Langevin:
                     change = jax.tree.map(lambda d: size * d, to.drift)
                     new = self._moved(problem, old, change)
                     gain = jnp.sum(merit(new) - now)
+                    worst = jnp.finfo(gain.dtype).max  # standing still: if nothing else is finite
+                    gain = jnp.where(size > 0.0, gain, worst)
                     return jnp.where(jnp.isfinite(gain), gain, jnp.inf), new
 
                 sizes = jnp.asarray(LADDER, old.x.dtype)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,17 @@ from numpy.typing import ArrayLike
 from mjx_drax._mujoco import mujoco
 from mjx_drax.dynamics import Dynamics, Static
 from mjx_drax.errors import DraxError
-from mjx_drax.problem import Problem, Trajectory, box, checked, cost_of, knots, scatter_box, vector
+from mjx_drax.problem import (
+    Aside,
+    Problem,
+    Trajectory,
+    box,
+    checked,
+    cost_of,
+    knots,
+    scatter_box,
+    vector,
+)
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     from mujoco import mjx  # announces on import that warp is missing; nothing here needs warp
@@ -116,10 +126,13 @@ class MjxDynamics(Dynamics):
                 wanted = u[c, k] + gains[c, k] @ (states[k] - plan[c, k])
                 applied[k] = data.ctrl[:] = np.clip(wanted, lower[k], upper[k])
                 mujoco.mj_step(model, data, self.substeps)
+                if any(data.warning[w].number for w in _BLOWN_UP):  # the engine reset itself
+                    states[k + 1 :] = applied[k:] = np.nan
+                    break
                 states[k + 1] = np.concatenate([data.qpos, data.qvel, data.act])
             return states, applied
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with _no_log_file(), ThreadPoolExecutor(os.cpu_count()) as pool:
             runs = list(pool.map(chain, range(len(u))))
         return np.stack([run[0] for run in runs]), np.stack([run[1] for run in runs])
 
@@ -129,6 +142,28 @@ class MjxDynamics(Dynamics):
         _set_state(self.mj_model, data, x)
         mujoco.mj_forward(self.mj_model, data)
         return data
+
+
+_BLOWN_UP = [
+    int(warning)
+    for warning in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_BADCTRL,
+    )
+]
+
+
+@contextlib.contextmanager
+def _no_log_file() -> Iterator[None]:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT where the user stands when a replay blows up."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
 
 
 def _set_state(model: mujoco.MjModel, data: mujoco.MjData, x: np.ndarray) -> None:
@@ -204,7 +239,7 @@ def from_mjcf(
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
-        horizon: duration [s]; K = horizon / dt knots.
+        horizon: duration [s]; K = horizon / dt knots, rounded.
         running_cost: l(data, u), a scalar, summed over the knots as it stands.
         terminal_cost: phi(data), a scalar.
         running_residual: r(data, u) (n,): adds 1/2 |r|^2 to the running cost.
@@ -249,10 +284,8 @@ def from_mjcf(
             x_init=x0,
             bounds=bounds,
             scatter=scatter_box(bounds, x0, jnp.asarray(reach), x_scatter, u_scatter),
-            goal=goal,
-            guess=guess,
+            aside=Aside(goal, guess, name),
             horizon=knots(horizon, dynamics.dt),
-            name=name,
         )
     )
 

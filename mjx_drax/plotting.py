@@ -22,12 +22,12 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE
+from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mjx_drax.dynamics import Dynamics
-    from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
 
     Draw = Callable[[Axes, np.ndarray], None]
 

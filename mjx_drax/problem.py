@@ -120,6 +120,24 @@ def _positive_part(matrix: Array) -> Array:
     return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
 
 
+@dataclass(frozen=True)
+class Aside:
+    """What a problem carries for use outside of compiled computations.
+
+    All compare equal: another goal or name does not recompile.
+    """
+
+    goal: Callable[[Any], Any] | None
+    guess: Callable[[Array], Trajectory] | None
+    name: str
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Aside)
+
+    def __hash__(self) -> int:
+        return hash(Aside)
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Problem:
@@ -135,10 +153,8 @@ class Problem:
         x_init: x_0, (nx,).
         bounds: the box that every knot must keep to.
         scatter: the box that initial knots are drawn from, uniformly.
-        goal: goal(dynamics.observe_replayed(x_K)) -> bool, or None: what a replay must reach.
-        guess: guess(key) -> Trajectory for one chain, or None: instead of `scatter`.
+        aside: goal, guess and name, which no compiled computation reads.
         horizon: K, number of control knots.
-        name: what files and tables call it.
     """
 
     dynamics: Dynamics
@@ -147,10 +163,23 @@ class Problem:
     x_init: Array
     bounds: Box
     scatter: Box
-    goal: Callable[[Any], Any] | None = field(metadata=Static)
-    guess: Callable[[Array], Trajectory] | None = field(metadata=Static)
+    aside: Aside = field(metadata=Static)
     horizon: int = field(metadata=Static)
-    name: str = field(metadata=Static)
+
+    @property
+    def goal(self) -> Callable[[Any], Any] | None:
+        """What a replay must reach: a test of dynamics.observe_replayed(x_K), or None."""
+        return self.aside.goal
+
+    @property
+    def guess(self) -> Callable[[Array], Trajectory] | None:
+        """Draws the initial knots of one chain from a key, instead of `scatter`; or None."""
+        return self.aside.guess
+
+    @property
+    def name(self) -> str:
+        """What files and tables call it."""
+        return self.aside.name
 
     @property
     def times(self) -> np.ndarray:
@@ -218,7 +247,7 @@ class Problem:
             ) from error
         if reached.size != 1:
             raise DraxError(f"goal returned shape {reached.shape}: it must return one truth value.")
-        return bool(reached.item())
+        return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:
         """The same problem from another initial state (nx,)."""
@@ -226,7 +255,7 @@ class Problem:
 
 
 def knots(horizon: float, dt: float) -> int:
-    """K, the number of control knots in a horizon [s] at a control step dt [s].
+    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
 
     Raises:
         DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
@@ -237,7 +266,7 @@ def knots(horizon: float, dt: float) -> int:
     count = round(horizon / dt)
     if count < 1:
         raise DraxError(
-            f"horizon is {horizon} s, shorter than one control step: give at least {dt} s."
+            f"horizon is {horizon} s, shorter than one control step: give at least {dt:g} s."
         )
     return count
 
@@ -256,8 +285,7 @@ def box(
     def end(value: ArrayLike, size: int, label: str) -> Array:
         try:
             array = np.asarray(value, float)
-            shape = np.broadcast_shapes(array.shape, (size,))
-            return jnp.asarray(np.broadcast_to(array, shape))
+            return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
         except ValueError as error:
             raise DraxError(
                 f"{label} is {value!r}: give numbers of shape ({size},), or one for all."
@@ -308,7 +336,7 @@ def from_function(
         x_init: x_0, (nx,).
         nu: size of a control.
         dt: control step [s].
-        horizon: duration [s]; K = horizon / dt knots.
+        horizon: duration [s]; K = horizon / dt knots, rounded.
         running_cost: l(x, u), a scalar, summed over the knots as it stands.
         terminal_cost: phi(x), a scalar.
         running_residual: r(x, u) (n,): adds 1/2 |r|^2 to the running cost.
@@ -336,10 +364,8 @@ def from_function(
             x_init=x_init,
             bounds=bounds,
             scatter=scatter_box(bounds, x_init, jnp.ones(nx), x_scatter, u_scatter),
-            goal=goal,
-            guess=guess,
+            aside=Aside(goal, guess, name),
             horizon=knots(horizon, dt),
-            name=name,
         )
     )
 
@@ -399,6 +425,13 @@ def checked(problem: Problem) -> Problem:
         ("scatter of x", problem.scatter.x_lower, problem.scatter.x_upper),
         ("scatter of u", problem.scatter.u_lower, problem.scatter.u_upper),
     ):
+        size = nx if label.endswith("x") else nu
+        for end in (lower, upper):
+            if end.shape not in ((size,), (problem.horizon, size)):
+                raise DraxError(
+                    f"bounds of {label} have shape {end.shape}: give numbers of shape ({size},), "
+                    f"or ({problem.horizon}, {size}) for each knot."
+                )
         crossed = np.argwhere(~(np.asarray(lower) <= np.asarray(upper)))
         if crossed.size:
             i = tuple(int(j) for j in crossed[0])
@@ -409,7 +442,7 @@ def checked(problem: Problem) -> Problem:
     outside = float(
         jnp.max(jnp.maximum(bounds.x_lower - problem.x_init, problem.x_init - bounds.x_upper))
     )
-    if outside > 1e-6:
+    if bounds.x_lower.ndim == bounds.x_upper.ndim == 1 and outside > 1e-6:
         raise DraxError(
             f"x_init = {np.asarray(problem.x_init).tolist()} lies outside the bounds of x by "
             f"{outside:.3g}: move it inside, or widen the bounds."

@@ -31,17 +31,24 @@ class Constant:
 class Geometric:
     """start (end / start)^t while noise is on; then on to `final` over the tail's first half.
 
-    Without `final` the tail holds `end`.
+    Without `final` the tail holds `end`. From a start of 0 the value stays 0.
     """
 
     start: ArrayLike
     end: ArrayLike
     final: ArrayLike | None = None
 
+    def __post_init__(self) -> None:
+        if self.final is None:  # always a number, so that giving one later does not recompile
+            object.__setattr__(self, "final", self.end)
+
     def __call__(self, t: Array) -> Array:
         """The value at progress t in [0, 2]."""
-        start, end = jnp.asarray(self.start), jnp.asarray(self.end)
-        value = start * (end / start) ** jnp.minimum(t, 1.0)
-        if self.final is None:
-            return value
-        return value * (self.final / end) ** jnp.clip(2.0 * (t - 1.0), 0.0, 1.0)
+        start, end, final = map(jnp.asarray, (self.start, self.end, self.final))
+        noisy = _between(start, end, jnp.minimum(t, 1.0))
+        return jnp.where(t <= 1.0, noisy, _between(end, final, jnp.clip(2.0 * (t - 1.0), 0.0, 1.0)))
+
+
+def _between(start: Array, end: Array, t: Array) -> Array:
+    """start^(1-t) end^t, where 0 stays 0."""
+    return start * (end / jnp.where(start == 0.0, 1.0, start)) ** t

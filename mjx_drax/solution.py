@@ -241,9 +241,9 @@ def solve(
     try:
         while done < total:
             stop = min(done + CHUNK, total)
-            state = advance(solver, problem, state, done, stop)
-            info = jax.block_until_ready(evaluate(problem, state.trajectory))
-            done = stop
+            ahead = advance(solver, problem, state, done, stop)
+            info = jax.block_until_ready(evaluate(problem, ahead.trajectory))
+            state, done = ahead, stop  # together, so that Ctrl-C never parts them
             records.append((done, info))
             feasible = np.asarray(info.max_defect) < FEASIBLE
             converged_at = np.where(feasible & (converged_at < 0), done, converged_at)

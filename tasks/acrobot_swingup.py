@@ -20,7 +20,7 @@ def make(horizon: float = 3.0) -> Problem:
         path("acrobot"),
         horizon=horizon,
         dt=DT,
-        running_residual=lambda data, u: np.sqrt(2 * DT) * u,
+        running_residual=effort,
         terminal_residual=upright,
         goal=lambda data: (
             np.all(np.cos(data.qpos - np.array([np.pi, 0.0])) > np.cos(0.1))
@@ -28,6 +28,11 @@ def make(horizon: float = 3.0) -> Problem:
         ),
         name="acrobot_swingup",
     )
+
+
+def effort(data: Any, u: Array) -> Array:
+    """Half its squared norm is dt u^2."""
+    return np.sqrt(2 * DT) * u
 
 
 def upright(data: Any) -> Array:

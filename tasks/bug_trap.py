@@ -42,7 +42,7 @@ def make(horizon: float = 11.9) -> Problem:
         dt=DT,
         horizon=horizon,
         running_residual=running,
-        terminal_residual=lambda x: np.sqrt(20.0) * (x[:2] - GOAL),
+        terminal_residual=terminal,
         x_bounds=([-3.0, -3.0, -np.inf], [3.0, 3.0, np.inf]),
         u_bounds=(-1.0, 1.0),
         x_scatter=([-3.0, -3.0, -np.pi], [3.0, 3.0, np.pi]),
@@ -61,6 +61,11 @@ def running(x: Array, u: Array) -> Array:
     distance = jnp.sum(jnp.square(x[:2] - WALL), axis=1)
     bumps = np.sqrt(2 * DT * 1000.0) * jnp.exp(-2.5 * distance)
     return jnp.concatenate([np.sqrt(2 * DT) * u, bumps])
+
+
+def terminal(x: Array) -> Array:
+    """Half its squared norm is 10 |p - goal|^2."""
+    return np.sqrt(20.0) * (x[:2] - GOAL)
 
 
 def draw(axes: Axes, states: np.ndarray) -> None:

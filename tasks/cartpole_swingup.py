@@ -21,13 +21,18 @@ def make(horizon: float = 2.0) -> Problem:
         path("cartpole"),
         horizon=horizon,
         dt=DT,
-        running_residual=lambda data, u: np.sqrt(2 * DT) * u,
+        running_residual=effort,
         terminal_residual=upright,
         goal=lambda data: (
             np.cos(data.qpos[1] - np.pi) > np.cos(0.1) and np.all(np.abs(data.qvel) < 0.5)
         ),
         name="cartpole_swingup",
     )
+
+
+def effort(data: Any, u: Array) -> Array:
+    """Half its squared norm is dt u^2."""
+    return np.sqrt(2 * DT) * u
 
 
 def upright(data: Any) -> Array:

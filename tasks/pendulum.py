@@ -33,8 +33,8 @@ def make(horizon: float = 4.9) -> Problem:
         nu=1,
         dt=DT,
         horizon=horizon,
-        running_residual=lambda x, u: np.sqrt(2 * 0.01 * DT) * u,
-        terminal_residual=lambda x: np.sqrt([20.0, 2.0]) * x,
+        running_residual=running,
+        terminal_residual=terminal,
         u_bounds=(-1.0, 1.0),
         x_scatter=(-6.0, 6.0),
         goal=lambda x: abs(x[0]) < 0.1 and abs(x[1]) < 0.5,
@@ -45,3 +45,13 @@ def make(horizon: float = 4.9) -> Problem:
 def step(x: Array, u: Array) -> Array:
     """Explicit Euler for m = l = 1, g = 9.81; angle 0 is upright."""
     return x + DT * jnp.array([x[1], u[0] + 9.81 * jnp.sin(x[0])])
+
+
+def running(x: Array, u: Array) -> Array:
+    """Half its squared norm is 0.01 dt u^2."""
+    return np.sqrt(2 * 0.01 * DT) * u
+
+
+def terminal(x: Array) -> Array:
+    """Half its squared norm is 10 angle^2 + velocity^2."""
+    return jnp.sqrt(jnp.array([20.0, 2.0])) * x

@@ -20,11 +20,16 @@ def make(horizon: float = 5.0) -> Problem:
         path("pendulum"),
         horizon=horizon,
         dt=DT,
-        running_residual=lambda data, u: np.sqrt(2 * DT) * u,
+        running_residual=effort,
         terminal_residual=upright,
         goal=lambda data: np.cos(data.qpos[0] - np.pi) > np.cos(0.1) and abs(data.qvel[0]) < 0.5,
         name="pendulum_swingup",
     )
+
+
+def effort(data: Any, u: Array) -> Array:
+    """Half its squared norm is dt u^2."""
+    return np.sqrt(2 * DT) * u
 
 
 def upright(data: Any) -> Array:

@@ -251,7 +251,8 @@ def test_overlay_says_what_is_certified(
         assert lines[0] == judged.problem.name
         assert (f"NOT CERTIFIED: {warning}" == lines[1]) == (not judged.certified)
         defect = "1e-06" if feasible else "0.1"
-        assert f"cost {judged.cost[judged.best_chain]:.3g}   max|h| {defect}" in lines
+        cost = f"{judged.cost[judged.best_chain]:.3g}"
+        assert f"cost {cost}   max|h| {defect}   bound violation 0" in lines
         assert lines[-2].startswith(f"{engine}, {mode}, ")
         assert lines[-1] == "t = {time}"
 
