@@ -96,7 +96,7 @@ class Langevin:
     step_size: ArrayLike = 0.3
     noise: Geometric | Constant = Geometric(0.3, 0.01)
     penalty: Geometric | Constant = Geometric(100.0, 1000.0, 1e4)
-    damping: Geometric | Constant = Geometric(0.1, 0.1, 0.01)
+    damping: Geometric | Constant = Geometric(0.1, 0.1, 0.03)
     barrier_weight: Geometric | Constant = Geometric(0.1, 0.01, 1e-4)
     preconditioner: GaussNewton | Identity = field(default_factory=GaussNewton)
     barrier: LogBarrier = field(default_factory=LogBarrier)
