@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mjx_drax.barrier import LogBarrier as LogBarrier
+    from mjx_drax.bounds import LogBarrier as LogBarrier
     from mjx_drax.errors import DraxError as DraxError
     from mjx_drax.langevin import Langevin as Langevin
     from mjx_drax.mjcf import from_mjcf as from_mjcf
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "LogBarrier": "barrier",
+    "LogBarrier": "bounds",
     "DraxError": "errors",
     "Langevin": "langevin",
     "from_mjcf": "mjcf",

@@ -24,15 +24,19 @@ from jax import Array
 from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
-from mjx_drax.barrier import LogBarrier
+from mjx_drax.bounds import LogBarrier
+from mjx_drax.dynamics import Static
+from mjx_drax.errors import DraxError
 from mjx_drax.precondition import (
+    Bounds,
     Direction,
     GaussNewton,
     Identity,
     Levels,
+    Multipliers,
     augmented_lagrangian,
 )
-from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.problem import Problem, Stagewise, Trajectory
 from mjx_drax.schedules import Constant, Geometric
 
 FEASIBLE = 1e-3
@@ -40,6 +44,9 @@ FEASIBLE = 1e-3
 
 LADDER = (*(0.5**i for i in range(9)), 0.0)
 """Step sizes that the tail chooses from."""
+
+SLACK = 1e-2
+"""Smallest slack that an inequality starts with."""
 
 
 @register_dataclass
@@ -49,7 +56,7 @@ class State:
 
     Attributes:
         trajectory: knots, (chains, K, nx) and (chains, K, nu).
-        multipliers: lambda, (chains, K, ndx).
+        multipliers: lambda, of dynamics (chains, K, ndx) and constraints.
         gains: time-varying LQR feedback of the last factorization, (chains, K, nu, ndx).
         key: random key of each chain, (chains,).
         alive: False from the moment a chain would have turned non-finite, (chains,).
@@ -57,7 +64,7 @@ class State:
     """
 
     trajectory: Trajectory
-    multipliers: Array
+    multipliers: Multipliers
     gains: Array
     key: Array
     alive: Array
@@ -67,7 +74,10 @@ class State:
 @register_dataclass
 @dataclass(frozen=True)
 class Info:
-    """Diagnostics of every chain: cost, max|h| and bound violation, (chains,) each."""
+    """Diagnostics of every chain: cost, max|h| and bound violation, (chains,) each.
+
+    h holds the dynamics' defects and all constraints; inequalities count where positive.
+    """
 
     cost: Array
     max_defect: Array
@@ -88,7 +98,9 @@ class Langevin:
         damping: schedule of delta, added to the diagonal of the cost's Hessian.
         barrier_weight: schedule of rho.
         preconditioner: the metric M.
-        barrier: how bounds are kept.
+        bounds: how bounds are kept.
+        adjusted: Metropolis-adjusted noisy steps (static; with `Identity` only): a chain without
+            constraints then samples exp(-c / sigma^2) exactly, whatever the step size.
     """
 
     iterations: int = 100
@@ -99,7 +111,8 @@ class Langevin:
     damping: Geometric | Constant = Geometric(0.1, 0.1, 0.03)
     barrier_weight: Geometric | Constant = Geometric(0.1, 0.01, 1e-4)
     preconditioner: GaussNewton | Identity = field(default_factory=GaussNewton)
-    barrier: LogBarrier = field(default_factory=LogBarrier)
+    bounds: Bounds = field(default_factory=LogBarrier)
+    adjusted: bool = field(default=False, metadata=Static)
 
     def levels(self, t: ArrayLike) -> Levels:
         """The schedules' values at progress t in [0, 2]."""
@@ -115,13 +128,25 @@ class Langevin:
             key: one random key; chain c uses fold_in(key, c), so that results do not depend on how
                 chains are split over calls or devices.
         """
+        if self.adjusted and not isinstance(self.preconditioner, Identity):
+            raise DraxError(
+                f"adjusted=True with {type(self.preconditioner).__name__}: Metropolis adjustment "
+                "needs a metric that does not change along the way; use Identity()."
+            )
         chains, dynamics = trajectory.x.shape[0], problem.dynamics
         K, nu, ndx = problem.horizon, dynamics.nu, dynamics.ndx
-        inside = jax.vmap(self.barrier.interior, in_axes=(None, 0))(problem.bounds, trajectory)
+        with_slack = jax.vmap(_with_slack, in_axes=(None, 0))(problem, trajectory)
+        inside = jax.vmap(self.bounds.interior, in_axes=(None, 0))(problem.bounds, with_slack)
+        m, m_end = (
+            c.equalities + c.inequalities for c in (problem.constraint, problem.terminal_constraint)
+        )
         return State(
             trajectory=inside,
-            multipliers=jnp.zeros((chains, K, ndx), inside.x.dtype),
-            gains=jnp.zeros((chains, K, nu, ndx), inside.x.dtype),
+            multipliers=Multipliers(
+                jnp.zeros((chains, K, ndx)),
+                Stagewise(jnp.zeros((chains, K, m)), jnp.zeros((chains, m_end))),
+            ),
+            gains=jnp.zeros((chains, K, nu, ndx)),
             key=jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains)),
             alive=jnp.ones(chains, bool),
             died_at=jnp.full(chains, -1),
@@ -138,10 +163,10 @@ class Langevin:
         )
         levels = self.levels(t)
 
-        def direction(trajectory: Trajectory, multipliers: Array, key: Array) -> Direction:
+        def direction(trajectory: Trajectory, multipliers: Multipliers, key: Array) -> Direction:
             return self.preconditioner.direction(
                 problem,
-                self.barrier,
+                self.bounds,
                 trajectory,
                 multipliers,
                 levels,
@@ -151,22 +176,32 @@ class Langevin:
         directions = jax.vmap(direction)(state.trajectory, state.multipliers, state.key)
 
         def diffuse(state: State) -> tuple[Trajectory, Array]:
-            def move(old: Trajectory, to: Direction) -> Trajectory:
+            def move(
+                old: Trajectory, multipliers: Multipliers, to: Direction, key: Array
+            ) -> Trajectory:
                 scale = levels.noise * jnp.sqrt(2.0 * self.step_size)
                 change = jax.tree.map(
                     lambda d, n: self.step_size * d + scale * n, to.drift, to.noise
                 )
-                return self._moved(problem, old, change)
+                new = self._moved(problem, old, change)
+                if not self.adjusted:
+                    return new
+                back = direction(new, multipliers, key).drift
+                ratio = self._log_acceptance(problem, old, new, multipliers, to.drift, back, levels)
+                u = jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, iteration), 1))
+                inside = problem.bounds.violation(jax.tree.map(jnp.add, old, change)) == 0.0
+                accepted = (jnp.log(u) < ratio) & inside
+                return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
 
-            moved = jax.vmap(move)(state.trajectory, directions)
+            moved = jax.vmap(move)(state.trajectory, state.multipliers, directions, state.key)
             return moved, jnp.broadcast_to(jnp.asarray(self.step_size), state.alive.shape)
 
         def descend(state: State) -> tuple[Trajectory, Array]:
             def search(
-                old: Trajectory, multipliers: Array, to: Direction
+                old: Trajectory, multipliers: Multipliers, to: Direction
             ) -> tuple[Trajectory, Array]:
                 def merit(z: Trajectory) -> Array:
-                    return augmented_lagrangian(problem, self.barrier, z, multipliers, levels)
+                    return augmented_lagrangian(problem, self.bounds, z, multipliers, levels)
 
                 now = merit(old)
 
@@ -186,32 +221,83 @@ class Langevin:
             return jax.vmap(search)(state.trajectory, state.multipliers, directions)
 
         trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
-        multipliers = state.multipliers + size[:, None, None] * directions.multipliers
+        multipliers = jax.tree.map(
+            lambda m, rate: m + _per_chain(size, m) * rate,
+            state.multipliers,
+            directions.multipliers,
+        )
         new = replace(state, trajectory=trajectory, multipliers=multipliers, gains=directions.gains)
         return _keep_finite(state, new, iteration)
+
+    def _log_acceptance(
+        self,
+        problem: Problem,
+        old: Trajectory,
+        new: Trajectory,
+        multipliers: Multipliers,
+        ahead: Trajectory,
+        back: Trajectory,
+        levels: Levels,
+    ) -> Array:
+        """log of the Metropolis-Hastings ratio for the density exp(-L_mu / sigma^2), scalar.
+
+        The proposal is z' ~ N(z + alpha d(z), 2 alpha sigma^2 I).
+        """
+        variance = 2.0 * jnp.asarray(self.step_size) * levels.noise**2
+
+        def merit(z: Trajectory) -> Array:
+            return augmented_lagrangian(problem, self.bounds, z, multipliers, levels)
+
+        def log_proposal(z: Trajectory, to: Trajectory, drift: Trajectory) -> Array:
+            off = jax.tree.map(lambda a, b, d: b - a - self.step_size * d, z, to, drift)
+            return -sum(jnp.sum(jnp.square(a)) for a in jax.tree.leaves(off)) / (2.0 * variance)
+
+        energy = jnp.sum(merit(new) - merit(old)) / levels.noise**2
+        return -energy + log_proposal(new, old, back) - log_proposal(old, new, ahead)
 
     def _moved(self, problem: Problem, old: Trajectory, change: Trajectory) -> Trajectory:
         """The knots `old` moved along a tangent `change`, kept inside the bounds."""
         x = jax.vmap(problem.dynamics.integrate)(old.x, change.x)
-        return self.barrier.confine(problem.bounds, old, Trajectory(x, old.u + change.u))
+        slack = jax.tree.map(jnp.add, old.slack, change.slack)
+        return self.bounds.confine(problem.bounds, old, Trajectory(x, old.u + change.u, slack))
+
+
+def _with_slack(problem: Problem, trajectory: Trajectory) -> Trajectory:
+    """The knots with slack variables that satisfy g + s = 0 where g <= 0, if there are any g."""
+    stage, terminal = problem.constraint, problem.terminal_constraint
+    if stage.inequalities + terminal.inequalities == 0:
+        return trajectory
+    g = problem.constraints(trajectory)
+    slack = Stagewise(
+        jnp.maximum(-g.stage[:, stage.equalities :], SLACK),
+        jnp.maximum(-g.terminal[terminal.equalities :], SLACK),
+    )
+    return replace(trajectory, slack=slack)
+
+
+def _per_chain(values: Array, like: Array) -> Array:
+    """One value for each chain (chains,), shaped to broadcast against (chains, ...)."""
+    return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
 def _keep_finite(old: State, new: State, iteration: Array) -> State:
     """The new state, where chains that would turn non-finite stay what they were."""
 
-    def numbers(state: State) -> tuple[Array, ...]:
-        return state.trajectory.x, state.trajectory.u, state.multipliers, state.gains
+    def numbers(state: State) -> tuple[Trajectory, Multipliers, Array]:
+        return state.trajectory, state.multipliers, state.gains
 
     finite = jnp.stack(
-        [jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim))) for a in numbers(new)]
+        [
+            jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim)))
+            for a in jax.tree.leaves(numbers(new))
+        ]
     ).all(0)
     alive = old.alive & finite
-    x, u, multipliers, gains = (
-        jnp.where(alive.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-        for a, b in zip(numbers(new), numbers(old), strict=True)
+    trajectory, multipliers, gains = jax.tree.map(
+        lambda a, b: jnp.where(_per_chain(alive, a), a, b), numbers(new), numbers(old)
     )
     died_at = jnp.where(old.alive & ~finite, iteration, old.died_at)
-    return State(Trajectory(x, u), multipliers, gains, old.key, alive, died_at)
+    return State(trajectory, multipliers, gains, old.key, alive, died_at)
 
 
 @jax.jit
@@ -219,9 +305,7 @@ def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     """Cost, max|h| and bound violation of a batch of trajectories."""
 
     def one(z: Trajectory) -> Info:
-        return Info(
-            problem.cost(z), jnp.max(jnp.abs(problem.defects(z))), problem.bounds.violation(z)
-        )
+        return Info(problem.cost(z), problem.max_defect(z), problem.bounds.violation(z))
 
     return jax.vmap(one)(trajectory)
 
@@ -236,3 +320,15 @@ def advance(
     (start = stop) just compiles it.
     """
     return jax.lax.fori_loop(start, stop, lambda i, s: solver.step(problem, s, i), state)
+
+
+@jax.jit
+def feedback_gains(solver: Langevin, problem: Problem, state: State) -> Array:
+    """Time-varying LQR gains (chains, K, nu, ndx) for a solver whose metric brings none."""
+
+    def gains(trajectory: Trajectory, multipliers: Multipliers, key: Array) -> Array:
+        levels = solver.levels(2.0)
+        to = GaussNewton().direction(problem, solver.bounds, trajectory, multipliers, levels, key)
+        return to.gains
+
+    return jax.vmap(gains)(state.trajectory, state.multipliers, state.key)

@@ -16,6 +16,8 @@ UNROLLED_UP_TO = 8
 def cholesky(matrix: Array) -> Array:
     """Lower triangular L (n, n) with L L' = matrix; only its lower triangle is read."""
     n = matrix.shape[-1]
+    if n == 0:
+        return matrix
     if n > UNROLLED_UP_TO:
         return jnp.linalg.cholesky(matrix)
     rows: list[list[Array]] = []
@@ -34,6 +36,8 @@ def cholesky(matrix: Array) -> Array:
 def solve_lower(factor: Array, b: Array) -> Array:
     """L^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
     n = factor.shape[-1]
+    if n == 0:
+        return b
     if n > UNROLLED_UP_TO:
         return solve_triangular(factor, b, lower=True)
     out: list[Array] = []
@@ -48,6 +52,8 @@ def solve_lower(factor: Array, b: Array) -> Array:
 def solve_upper(factor: Array, b: Array) -> Array:
     """L'^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
     n = factor.shape[-1]
+    if n == 0:
+        return b
     if n > UNROLLED_UP_TO:
         return solve_triangular(factor, b, lower=True, trans=1)
     out: list[Array] = [b[0]] * n

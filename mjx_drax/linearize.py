@@ -5,14 +5,13 @@ h_k(dz) ~ h_k + A_k dx_k + B_k du_k - dx_{k+1},     A = df/dx (ndx, ndx),  B = d
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import register_dataclass
 
+from mjx_drax.derivatives import Differentiator
 from mjx_drax.problem import Problem, Trajectory
 
 
@@ -26,24 +25,20 @@ class Linearization:
     h: Array
 
 
-Linearize = Callable[[Problem, Trajectory], Linearization]
-
-
-def autodiff(problem: Problem, trajectory: Trajectory) -> Linearization:
-    """Exact A and B by forward-mode differentiation, ndx + nu tangents a knot.
-
-    Forward mode passes through the solver loops of MJX, which reverse mode does not.
-    """
+def linearize(
+    problem: Problem, trajectory: Trajectory, by: Differentiator, keys: Array
+) -> Linearization:
+    """The dynamics at every knot, with one random key for each, (K,)."""
     dynamics = problem.dynamics
+    ndx = dynamics.ndx
 
-    def linearize(x: Array, u: Array, x_next: Array) -> Linearization:
-        def defect(dz: Array) -> tuple[Array, Array]:
-            moved = dynamics.integrate(x, dz[: dynamics.ndx])
-            h = dynamics.difference(dynamics.step(moved, u + dz[dynamics.ndx :]), x_next)
-            return h, h
+    def stage(x: Array, u: Array, x_next: Array, key: Array) -> Linearization:
+        def defect(dz: Array) -> Array:
+            moved = dynamics.integrate(x, dz[:ndx])
+            return dynamics.difference(dynamics.step(moved, u + dz[ndx:]), x_next)
 
-        zero = jnp.zeros(dynamics.ndx + dynamics.nu, x.dtype)
-        jacobian, h = jax.jacfwd(defect, has_aux=True)(zero)
-        return Linearization(jacobian[:, : dynamics.ndx], jacobian[:, dynamics.ndx :], h)
+        jacobian, h = by.jacobian(defect, ndx + dynamics.nu, key)
+        return Linearization(jacobian[:, :ndx], jacobian[:, ndx:], h)
 
-    return jax.vmap(linearize)(problem.stages(trajectory), trajectory.u, trajectory.x)
+    stages = problem.stages(trajectory)
+    return jax.vmap(stage)(stages, trajectory.u, trajectory.x, keys)

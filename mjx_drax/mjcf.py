@@ -30,6 +30,7 @@ from mjx_drax.problem import (
     Trajectory,
     box,
     checked,
+    constraints_of,
     cost_of,
     knots,
     scatter_box,
@@ -221,6 +222,10 @@ def from_mjcf(
     terminal_cost: Callable[..., Any] | None = None,
     running_residual: Callable[..., Any] | None = None,
     terminal_residual: Callable[..., Any] | None = None,
+    equality: Callable[..., Any] | None = None,
+    inequality: Callable[..., Any] | None = None,
+    terminal_equality: Callable[..., Any] | None = None,
+    terminal_inequality: Callable[..., Any] | None = None,
     dt: float | None = None,
     x_init: ArrayLike | None = None,
     x_bounds: tuple[ArrayLike, ArrayLike] | None = None,
@@ -244,6 +249,10 @@ def from_mjcf(
         terminal_cost: phi(data), a scalar.
         running_residual: r(data, u) (n,): adds 1/2 |r|^2 to the running cost.
         terminal_residual: r(data) (n,): adds 1/2 |r|^2 to the terminal cost.
+        equality: c(data, u) (m,), held at 0 at every stage k = 0..K-1.
+        inequality: g(data, u) (m,), held <= 0 at every stage.
+        terminal_equality: c(data) (m,), held at 0 at x_K.
+        terminal_inequality: g(data) (m,), held <= 0 at x_K.
         dt: control step [s], a multiple of the model's timestep; by default the multiple that comes
             closest to 0.02 s.
         x_init: x_0 = [qpos, qvel, act]; by default the first keyframe, else the default pose.
@@ -276,11 +285,16 @@ def from_mjcf(
         )
     reach = np.concatenate([_joint_reach(host), np.full(host.nv, 5.0), np.ones(host.na)])
     bounds = _bounds(host, dynamics, x_bounds, u_bounds)
+    constraint, terminal_constraint = constraints_of(
+        dynamics, equality, inequality, terminal_equality, terminal_inequality
+    )
     return checked(
         Problem(
             dynamics=dynamics,
             running=cost_of(running_cost, running_residual),
             terminal=cost_of(terminal_cost, terminal_residual),
+            constraint=constraint,
+            terminal_constraint=terminal_constraint,
             x_init=x0,
             bounds=bounds,
             scatter=scatter_box(bounds, x0, jnp.asarray(reach), x_scatter, u_scatter),

@@ -3,24 +3,30 @@
     X      <- X + alpha d + sigma sqrt(2 alpha) n,      d = -M^{-1} grad L_mu,   n ~ N(0, M^{-1})
     lambda <- lambda + alpha r
 
-L_mu(X, lambda) = c(X) + rho b(X) + lambda'h(X) + mu/2 |h(X)|^2 with the barrier b. M is held fixed
-within a step; the divergence of a state-dependent metric is dropped.
+L_mu(X, lambda) = c(X) + rho b(X) + lambda'h(X) + mu/2 |h(X)|^2 with the barrier b, where h holds
+the defects of the dynamics, equality constraints, and inequality constraints with their slack
+variables, g + s = 0. M is held fixed within a step; the divergence of a state-dependent metric is
+dropped.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import register_dataclass
 
-from mjx_drax.barrier import LogBarrier
-from mjx_drax.dynamics import Static
-from mjx_drax.linearize import Linearize, autodiff
-from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.bounds import LogBarrier, Projection, Reflection
+from mjx_drax.constraints import Eliminated, eliminate, recover
+from mjx_drax.derivatives import Autodiff, Differentiator
+from mjx_drax.linearize import Linearization, linearize
+from mjx_drax.problem import Problem, Stagewise, Trajectory
 from mjx_drax.riccati import QuadraticCost, factorize, solve_and_sample
+
+Bounds = LogBarrier | Projection | Reflection
 
 
 @register_dataclass
@@ -36,27 +42,44 @@ class Levels:
 
 @register_dataclass
 @dataclass(frozen=True)
+class Multipliers:
+    """lambda, of the dynamics (K, ndx) and of the constraints."""
+
+    dynamics: Array
+    constraints: Stagewise
+
+
+@register_dataclass
+@dataclass(frozen=True)
 class Direction:
     """One step's ingredients, in tangent space.
 
     Attributes:
         drift: d.
         noise: n, for sigma = 1.
-        multipliers: their rate r, (K, ndx).
+        multipliers: their rate r.
         gains: feedback that comes with the metric, (K, nu, ndx); zeros if none does.
     """
 
     drift: Trajectory
     noise: Trajectory
-    multipliers: Array
+    multipliers: Multipliers
     gains: Array
+
+
+def residuals(problem: Problem, trajectory: Trajectory) -> tuple[Array, Stagewise]:
+    """h: the defects (K, ndx), and the constraints [equality; inequality + slack]."""
+    values = problem.constraints(trajectory)
+    if trajectory.slack is not None:
+        values = problem.with_slack(values, trajectory.slack)
+    return problem.defects(trajectory), values
 
 
 def augmented_lagrangian(
     problem: Problem,
-    barrier: LogBarrier,
+    bounds: Bounds,
     trajectory: Trajectory,
-    multipliers: Array,
+    multipliers: Multipliers,
     levels: Levels,
 ) -> Array:
     """L_mu = c + rho b + lambda'h + mu/2 |h|^2 as one term per stage, (K + 1,).
@@ -64,12 +87,25 @@ def augmented_lagrangian(
     Two trajectories are compared by summing the differences of their terms, which keeps far more
     digits in float32 than the difference of their sums.
     """
-    h = problem.defects(trajectory)
-    walls = barrier.value(problem.bounds, trajectory)
-    stage = jax.vmap(problem.running_cost)(problem.stages(trajectory), trajectory.u)
-    stage = stage + levels.barrier * walls
-    stage = stage + jnp.sum(multipliers * h + 0.5 * levels.penalty * jnp.square(h), axis=1)
-    return jnp.append(stage, problem.terminal_cost(trajectory.x[-1]))
+    walls = levels.barrier * bounds.value(problem.bounds, trajectory)
+    return jnp.append(walls, 0.0) + _penalized(problem, trajectory, multipliers, levels)
+
+
+def _penalized(
+    problem: Problem, trajectory: Trajectory, multipliers: Multipliers, levels: Levels
+) -> Array:
+    """c + lambda'h + mu/2 |h|^2 as one term per stage, (K + 1,)."""
+
+    def penalty(multiplier: Array, h: Array) -> Array:
+        return jnp.sum(multiplier * h + 0.5 * levels.penalty * jnp.square(h), axis=-1)
+
+    h, values = residuals(problem, trajectory)
+    running = jax.vmap(problem.running_cost)(problem.stages(trajectory), trajectory.u)
+    running = running + penalty(multipliers.dynamics, h)
+    running = running + penalty(multipliers.constraints.stage, values.stage)
+    terminal = problem.terminal_cost(trajectory.x[-1])
+    terminal = terminal + penalty(multipliers.constraints.terminal, values.terminal)
+    return jnp.append(running, terminal)
 
 
 @register_dataclass
@@ -78,35 +114,126 @@ class Identity:
     """M = I: the flow of the paper as printed, with alpha = dt / 2.
 
     X <- X - alpha grad L_mu + sigma sqrt(2 alpha) xi,  lambda <- lambda + 2 alpha mu h.
+
+    The gradient is exact, from one reverse-mode derivative of L_mu; nothing of the Gauss-Newton
+    machinery is computed. With sampled derivatives (`derivatives=Smoothed(...)`) it is assembled
+    from J and the cost's gradient knot by knot instead.
     """
+
+    derivatives: Differentiator | None = None
 
     def direction(
         self,
         problem: Problem,
-        barrier: LogBarrier,
+        bounds: Bounds,
         trajectory: Trajectory,
-        multipliers: Array,
+        multipliers: Multipliers,
         levels: Levels,
         key: Array,
     ) -> Direction:
-        """Drift, noise and multiplier rate, from one reverse-mode derivative of L_mu."""
-
-        def smooth(z: Trajectory) -> tuple[Array, Array]:
-            h = problem.defects(z)
-            penalized = jnp.sum(multipliers * h) + 0.5 * levels.penalty * jnp.sum(jnp.square(h))
-            return problem.cost(z) + penalized, h
-
-        slope, h = jax.grad(smooth, has_aux=True)(trajectory)
-        walls, _ = barrier.derivatives(problem.bounds, trajectory)
-        drift = jax.tree.map(lambda g, b: -(g + levels.barrier * b), slope, walls)
-        key_x, key_u = jax.random.split(key)
-        noise = Trajectory(
-            jax.random.normal(key_x, trajectory.x.shape, trajectory.x.dtype),
-            jax.random.normal(key_u, trajectory.u.shape, trajectory.u.dtype),
-        )
+        """Drift, noise and multiplier rate."""
         dynamics = problem.dynamics
+        key_noise, key_samples = jax.random.split(key)
+        if self.derivatives is None:
+            slope = jax.grad(lambda z: jnp.sum(_penalized(problem, z, multipliers, levels)))(
+                trajectory
+            )
+        else:
+            model = expand(problem, trajectory, self.derivatives, key_samples)
+            slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
+        walls, _ = bounds.derivatives(problem.bounds, trajectory)
+        drift = jax.tree.map(lambda g, b: -(g + levels.barrier * b), slope, walls)
+        leaves, tree = jax.tree.flatten(trajectory)
+        keys = jax.random.split(key_noise, len(leaves))
+        noise = [jax.random.normal(k, z.shape, z.dtype) for k, z in zip(keys, leaves, strict=True)]
+        h, values = residuals(problem, trajectory)
+        rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, Multipliers(h, values))
         no_gains = jnp.zeros((problem.horizon, dynamics.nu, dynamics.ndx), h.dtype)
-        return Direction(drift, noise, 2.0 * levels.penalty * h, no_gains)
+        return Direction(drift, jax.tree.unflatten(tree, noise), rate, no_gains)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Model:
+    """Derivatives of everything at every knot, before any metric or barrier.
+
+    Attributes:
+        dynamics: A, B and h.
+        cost: gradients, and semidefinite Hessians.
+        stage: Jacobian of the constraints in (dx, du), (K, m, ndx + nu).
+        terminal: Jacobian of the terminal constraints in dx, (m_end, ndx).
+        residual: constraints [equality; inequality + slack].
+    """
+
+    dynamics: Linearization
+    cost: QuadraticCost
+    stage: Array
+    terminal: Array
+    residual: Stagewise
+
+
+def expand(problem: Problem, trajectory: Trajectory, by: Differentiator, key: Array) -> Model:
+    """Differentiate dynamics, costs and constraints at every knot."""
+    dynamics = problem.dynamics
+    ndx, nu = dynamics.ndx, dynamics.nu
+    keys = jax.random.split(key, problem.horizon + 1)
+
+    def stage(x: Array, u: Array, key: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        def at(dz: Array) -> tuple[Any, Array]:
+            moved = u + dz[ndx:]
+            return dynamics.observe(dynamics.integrate(x, dz[:ndx]), moved), moved
+
+        return problem.running.expand(at, ndx + nu, by, key), by.jacobian(
+            lambda dz: problem.constraint(*at(dz)), ndx + nu, key
+        )
+
+    def end(dx: Array) -> tuple[Any]:
+        moved = dynamics.integrate(trajectory.x[-1], dx)
+        return (dynamics.observe(moved, jnp.zeros(nu)),)
+
+    (g, H), (J, values) = jax.vmap(stage)(problem.stages(trajectory), trajectory.u, keys[:-1])
+    g_end, H_end = problem.terminal.expand(end, ndx, by, keys[-1])
+    J_end, values_end = by.jacobian(lambda dx: problem.terminal_constraint(*end(dx)), ndx, keys[-1])
+    residual = Stagewise(values, values_end)
+    if trajectory.slack is not None:
+        residual = problem.with_slack(residual, trajectory.slack)
+    return Model(
+        dynamics=linearize(problem, trajectory, by, keys[:-1]),
+        cost=QuadraticCost(
+            jnp.concatenate([g[:, :ndx], g_end[None]]),
+            g[:, ndx:],
+            jnp.concatenate([H[:, :ndx, :ndx], H_end[None]]),
+            H[:, ndx:, :ndx],
+            H[:, ndx:, ndx:],
+        ),
+        stage=J,
+        terminal=J_end,
+        residual=residual,
+    )
+
+
+def _assembled_gradient(
+    model: Model, trajectory: Trajectory, multipliers: Multipliers, penalty: Array
+) -> Trajectory:
+    """The gradient of c + lambda'h + mu/2 |h|^2, put together from the derivatives of a model."""
+    ndx = model.dynamics.h.shape[-1]
+    h = Multipliers(model.dynamics.h, model.residual)
+    force = jax.tree.map(lambda m, r: m + penalty * r, multipliers, h)  # lambda + mu h
+    stage = jnp.einsum("kij,ki->kj", model.stage, force.constraints.stage)
+    gx = model.cost.gx.at[:-1].add(stage[:, :ndx])
+    gx = gx.at[-1].add(model.terminal.T @ force.constraints.terminal)
+    gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", model.dynamics.A, force.dynamics))
+    gu = model.cost.gu + stage[:, ndx:]
+    gu = gu + jnp.einsum("kij,ki->kj", model.dynamics.B, force.dynamics)
+    return Trajectory(gx[1:] - force.dynamics, gu, _slacks(trajectory, force.constraints))
+
+
+def _slacks(trajectory: Trajectory, rows: Stagewise) -> Stagewise | None:
+    """The rows of constraints that belong to inequalities, which have slacks."""
+    slack = trajectory.slack
+    if slack is None:
+        return None
+    return jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], slack, rows)
 
 
 @register_dataclass
@@ -114,72 +241,90 @@ class Identity:
 class GaussNewton:
     """M = H + mu J'J + delta I, with H the Gauss-Newton model of c plus the barrier's diagonal.
 
-    The multipliers follow the predicted, noise-free defect: r = mu (h + J d).
+    The multipliers follow the predicted, noise-free residual: r = mu (h + J d).
     """
 
-    linearize: Linearize = field(default=autodiff, metadata=Static)
+    derivatives: Differentiator = field(default_factory=Autodiff)
 
     def direction(
         self,
         problem: Problem,
-        barrier: LogBarrier,
+        bounds: Bounds,
         trajectory: Trajectory,
-        multipliers: Array,
+        multipliers: Multipliers,
         levels: Levels,
         key: Array,
     ) -> Direction:
         """Drift, noise and multiplier rate, from one block-tridiagonal factorization."""
-        model = self.linearize(problem, trajectory)
-        cost = quadratic_cost(problem, barrier, trajectory, levels)
-        factors = factorize(model, cost, multipliers, levels.penalty)
-        dx, du, nx, nu, rate = solve_and_sample(model, factors, multipliers, levels.penalty, key)
-        return Direction(Trajectory(dx, du), Trajectory(nx, nu), rate, factors.K)
-
-
-@jax.jit
-def feedback_gains(
-    problem: Problem, barrier: LogBarrier, trajectory: Trajectory, levels: Levels
-) -> Array:
-    """Time-varying LQR gains (chains, K, nu, ndx) around given trajectories."""
-
-    def gains(z: Trajectory) -> Array:
-        model, cost = autodiff(problem, z), quadratic_cost(problem, barrier, z, levels)
-        return factorize(model, cost, jnp.zeros_like(model.h), levels.penalty).K
-
-    return jax.vmap(gains)(trajectory)
-
-
-def quadratic_cost(
-    problem: Problem, barrier: LogBarrier, trajectory: Trajectory, levels: Levels
-) -> QuadraticCost:
-    """Second-order model of c + rho b + delta/2 |dz|^2 at every knot."""
-    dynamics = problem.dynamics
-    ndx, nu = dynamics.ndx, dynamics.nu
-
-    def running(x: Array, u: Array) -> tuple[Array, Array]:
-        def at(dz: Array) -> tuple[object, Array]:
-            moved = u + dz[ndx:]
-            return dynamics.observe(dynamics.integrate(x, dz[:ndx]), moved), moved
-
-        return problem.running.expand(at, ndx + nu)
-
-    def terminal(x: Array) -> tuple[Array, Array]:
-        return problem.terminal.expand(
-            lambda dx: (dynamics.observe(dynamics.integrate(x, dx), jnp.zeros(nu)),), ndx
+        key_model, key_noise, key_slack = jax.random.split(key, 3)
+        model = expand(problem, trajectory, self.derivatives, key_model)
+        cost = _with_barrier(model.cost, problem, bounds, trajectory, levels)
+        slope, curvature = (
+            d.slack or Stagewise(jnp.zeros((problem.horizon, 0)), jnp.zeros(0))
+            for d in bounds.derivatives(problem.bounds, trajectory)
         )
 
-    g, H = jax.vmap(running)(problem.stages(trajectory), trajectory.u)
-    g_end, H_end = terminal(trajectory.x[-1])
-    slope, curvature = barrier.derivatives(problem.bounds, trajectory)
-    gx = jnp.concatenate([g[:, :ndx], g_end[None]]).at[1:].add(levels.barrier * slope.x)
-    gu = g[:, ndx:] + levels.barrier * slope.u
-    Hxx = jnp.concatenate([H[:, :ndx, :ndx], H_end[None]])
-    diagonal_x = jnp.full_like(gx, levels.damping).at[1:].add(levels.barrier * curvature.x)
+        def reduce(J: Array, r: Array, nu: Array, b: Array, c: Array) -> Any:
+            damped = levels.barrier * c + levels.damping
+            return eliminate(J, r, nu, levels.barrier * b, damped, levels.penalty)
+
+        r, nu = model.residual, multipliers.constraints
+        g, H, blocks = jax.vmap(reduce)(
+            model.stage, r.stage, nu.stage, slope.stage, curvature.stage
+        )
+        g_end, H_end, block_end = reduce(
+            model.terminal, r.terminal, nu.terminal, slope.terminal, curvature.terminal
+        )
+        ndx = problem.dynamics.ndx
+        cost = QuadraticCost(
+            cost.gx + jnp.concatenate([g[:, :ndx], g_end[None]]),
+            cost.gu + g[:, ndx:],
+            cost.Hxx + jnp.concatenate([H[:, :ndx, :ndx], H_end[None]]),
+            cost.Hux + H[:, ndx:, :ndx],
+            cost.Huu + H[:, ndx:, ndx:],
+        )
+        factors = factorize(model.dynamics, cost, multipliers.dynamics, levels.penalty)
+        dx, du, nx, nu_, rate = solve_and_sample(
+            model.dynamics, factors, multipliers.dynamics, levels.penalty, key_noise
+        )
+
+        def back(block: Eliminated, dz: Array, nz: Array, xi: Array) -> Any:
+            return recover(block, dz, nz, xi, levels.penalty)
+
+        white = (
+            jax.random.normal(key_slack, blocks.D.shape),
+            jax.random.normal(jax.random.fold_in(key_slack, 1), block_end.D.shape),
+        )
+        ds, ns, rate_stage = jax.vmap(back)(
+            blocks, _stage_steps(dx, du), _stage_steps(nx, nu_), white[0]
+        )
+        ds_end, ns_end, rate_end = back(block_end, dx[-1], nx[-1], white[1])
+        has_slack = trajectory.slack is not None
+        return Direction(
+            Trajectory(dx, du, Stagewise(ds, ds_end) if has_slack else None),
+            Trajectory(nx, nu_, Stagewise(ns, ns_end) if has_slack else None),
+            Multipliers(rate, Stagewise(rate_stage, rate_end)),
+            factors.K,
+        )
+
+
+def _stage_steps(dx: Array, du: Array) -> Array:
+    """(dx_k, du_k) for k = 0..K-1, (K, ndx + nu), from steps of x_1..x_K; dx_0 = 0."""
+    before = jnp.concatenate([jnp.zeros_like(dx[:1]), dx[:-1]])
+    return jnp.concatenate([before, du], axis=1)
+
+
+def _with_barrier(
+    cost: QuadraticCost, problem: Problem, bounds: Bounds, trajectory: Trajectory, levels: Levels
+) -> QuadraticCost:
+    """The model of c + rho b + delta/2 |dz|^2; there is no barrier on x_0, which is fixed."""
+    slope, curvature = bounds.derivatives(problem.bounds, trajectory)
+    diagonal_x = jnp.full_like(cost.gx, levels.damping).at[1:].add(levels.barrier * curvature.x)
     diagonal_u = levels.damping + levels.barrier * curvature.u
     return QuadraticCost(
-        gx,
-        gu,
-        Hxx + jax.vmap(jnp.diag)(diagonal_x),
-        H[:, ndx:, :ndx],
-        H[:, ndx:, ndx:] + jax.vmap(jnp.diag)(diagonal_u),
+        cost.gx.at[1:].add(levels.barrier * slope.x),
+        cost.gu + levels.barrier * slope.u,
+        cost.Hxx + jax.vmap(jnp.diag)(diagonal_x),
+        cost.Hux,
+        cost.Huu + jax.vmap(jnp.diag)(diagonal_u),
     )

@@ -20,17 +20,32 @@ from jax import Array
 from jax.tree_util import Partial, register_dataclass
 from numpy.typing import ArrayLike
 
+from mjx_drax.derivatives import Differentiator, positive_part
 from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
 from mjx_drax.errors import DraxError
 
 
 @register_dataclass
 @dataclass(frozen=True)
+class Stagewise:
+    """Numbers that go with constraints: for the stages (..., K, m) and for the end (..., m_end)."""
+
+    stage: Array
+    terminal: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
 class Trajectory:
-    """Knot points: states x_1..x_K (..., K, nx) and controls u_0..u_{K-1} (..., K, nu)."""
+    """Knot points: states x_1..x_K (..., K, nx) and controls u_0..u_{K-1} (..., K, nu).
+
+    What a chain carries also has the slack variables s >= 0 of inequalities; a trajectory that a
+    user gives does not.
+    """
 
     x: Array
     u: Array
+    slack: Stagewise | None = None
 
 
 @register_dataclass
@@ -46,21 +61,28 @@ class Box:
     def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
         """The lower and the upper end for every knot of a trajectory, as two trajectories."""
         x, u = trajectory.x, trajectory.u
-        lower = Trajectory(
-            jnp.broadcast_to(self.x_lower, x.shape), jnp.broadcast_to(self.u_lower, u.shape)
-        )
-        upper = Trajectory(
-            jnp.broadcast_to(self.x_upper, x.shape), jnp.broadcast_to(self.u_upper, u.shape)
-        )
+        zeros = jax.tree.map(jnp.zeros_like, trajectory.slack)
+        infinite = jax.tree.map(lambda s: jnp.full_like(s, jnp.inf), trajectory.slack)
+
+        def side(of_x: Array, of_u: Array, of_slack: Stagewise | None) -> Trajectory:
+            return Trajectory(
+                jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape), of_slack
+            )
+
+        lower = side(self.x_lower, self.u_lower, zeros)
+        upper = side(self.x_upper, self.u_upper, infinite)
         return lower, upper
 
     def violation(self, trajectory: Trajectory) -> Array:
         """Largest distance by which any knot leaves the box, 0 if none does, scalar."""
         lower, upper = self.sides(trajectory)
         out = jax.tree.map(
-            lambda z, a, b: jnp.maximum(jnp.max(a - z), jnp.max(z - b)), trajectory, lower, upper
+            lambda z, a, b: jnp.maximum((a - z).max(initial=0.0), (z - b).max(initial=0.0)),
+            trajectory,
+            lower,
+            upper,
         )
-        return jnp.maximum(jnp.maximum(out.x, out.u), 0.0)
+        return jnp.maximum(out.x, out.u)
 
 
 @register_dataclass
@@ -84,40 +106,57 @@ class Cost:
             total = total + 0.5 * jnp.sum(jnp.square(self.residual(*arguments)))
         return total
 
-    def expand(self, at: Callable[[Array], tuple[Any, ...]], size: int) -> tuple[Array, Array]:
+    def expand(
+        self, at: Callable[[Array], tuple[Any, ...]], size: int, by: Differentiator, key: Array
+    ) -> tuple[Array, Array]:
         """Gradient (n,) and positive semidefinite Hessian (n, n) in local coordinates.
 
         `at(dz)` gives the cost's arguments a displacement dz (n,) away from the knot. The residual
         contributes J'r and J'J; the scalar its gradient, and its Hessian with negative eigenvalues
-        set to zero (the nearest positive semidefinite matrix in the Frobenius norm).
+        set to zero.
         """
-        zero = jnp.zeros(size)
-        gradient, hessian = zero, jnp.zeros((size, size))
+        gradient, hessian = jnp.zeros(size), jnp.zeros((size, size))
         if self.scalar is not None:
             scalar = self.scalar
 
             def value(dz: Array) -> Array:
                 return scalar(*at(dz))
 
-            gradient = gradient + jax.jacfwd(value)(zero)
-            hessian = hessian + _positive_part(jax.jacfwd(jax.jacfwd(value))(zero))
+            slope, _ = by.jacobian(lambda dz: value(dz)[None], size, key)
+            gradient = gradient + slope[0]
+            hessian = hessian + positive_part(by.hessian(value, size))
         if self.residual is not None:
             residual = self.residual
-
-            def with_value(dz: Array) -> tuple[Array, Array]:
-                r = jnp.ravel(residual(*at(dz)))
-                return r, r
-
-            jacobian, r = jax.jacfwd(with_value, has_aux=True)(zero)
+            jacobian, r = by.jacobian(lambda dz: jnp.ravel(residual(*at(dz))), size, key)
             gradient = gradient + jacobian.T @ r
             hessian = hessian + jacobian.T @ jacobian
         return gradient, hessian
 
 
-def _positive_part(matrix: Array) -> Array:
-    """The nearest positive semidefinite matrix to a symmetric one (n, n)."""
-    values, vectors = jnp.linalg.eigh(0.5 * (matrix + matrix.T))
-    return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
+@register_dataclass
+@dataclass(frozen=True)
+class Constraint:
+    """equality(...) = 0 and inequality(...) <= 0, either part optional; rows in that order."""
+
+    equality: Partial | None
+    inequality: Partial | None
+    equalities: int = field(metadata=Static)
+    inequalities: int = field(metadata=Static)
+
+    def __call__(self, *arguments: Any) -> Array:
+        """Both parts in one vector, (equalities + inequalities,)."""
+        parts = [p for p in (self.equality, self.inequality) if p is not None]
+        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
+
+    def with_slack(self, values: Array, slack: Array) -> Array:
+        """The equality constraints [equality; inequality + slack], for values (..., m)."""
+        inequality = values[..., self.equalities :] + slack
+        return jnp.concatenate([values[..., : self.equalities], inequality], axis=-1)
+
+    def violation(self, values: Array) -> Array:
+        """Largest |equality| or positive inequality, scalar; 0 without constraints."""
+        equality = jnp.abs(values[..., : self.equalities]).max(initial=0.0)
+        return jnp.maximum(equality, values[..., self.equalities :].max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -150,6 +189,8 @@ class Problem:
         dynamics: x_{k+1} = f(x_k, u_k).
         running: l, called with (dynamics.observe(x, u), u).
         terminal: phi, called with (dynamics.observe(x, 0),).
+        constraint: equality and inequality on (dynamics.observe(x, u), u) at every stage.
+        terminal_constraint: the same on (dynamics.observe(x, 0),) at x_K.
         x_init: x_0, (nx,).
         bounds: the box that every knot must keep to.
         scatter: the box that initial knots are drawn from, uniformly.
@@ -160,6 +201,8 @@ class Problem:
     dynamics: Dynamics
     running: Cost
     terminal: Cost
+    constraint: Constraint
+    terminal_constraint: Constraint
     x_init: Array
     bounds: Box
     scatter: Box
@@ -216,6 +259,34 @@ class Problem:
             return self.dynamics.difference(self.dynamics.step(x, u), x_next)
 
         return jax.vmap(defect)(self.stages(trajectory), trajectory.u, trajectory.x)
+
+    def constraints(self, trajectory: Trajectory) -> Stagewise:
+        """Values [equality; inequality] at the stages (K, m) and at the end (m_end,)."""
+        dynamics = self.dynamics
+
+        def stage(x: Array, u: Array) -> Array:
+            return self.constraint(dynamics.observe(x, u), u)
+
+        end = dynamics.observe(trajectory.x[-1], jnp.zeros(dynamics.nu))
+        return Stagewise(
+            jax.vmap(stage)(self.stages(trajectory), trajectory.u), self.terminal_constraint(end)
+        )
+
+    def with_slack(self, values: Stagewise, slack: Stagewise) -> Stagewise:
+        """The equality constraints [equality; inequality + slack]."""
+        return Stagewise(
+            self.constraint.with_slack(values.stage, slack.stage),
+            self.terminal_constraint.with_slack(values.terminal, slack.terminal),
+        )
+
+    def max_defect(self, trajectory: Trajectory) -> Array:
+        """max|h| over dynamics and constraints (inequalities count where positive), scalar."""
+        values = self.constraints(trajectory)
+        defect = jnp.abs(self.defects(trajectory)).max(initial=0.0)
+        stage = self.constraint.violation(values.stage)
+        return jnp.maximum(
+            defect, jnp.maximum(stage, self.terminal_constraint.violation(values.terminal))
+        )
 
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible."""
@@ -309,6 +380,40 @@ def cost_of(cost: Callable[..., Any] | None, residual: Callable[..., Any] | None
     )
 
 
+def constraint_of(
+    equality: Callable[..., Any] | None,
+    inequality: Callable[..., Any] | None,
+    arguments: tuple[Any, ...],
+    label: str = "",
+) -> Constraint:
+    """A Constraint from the functions that a user gives; their sizes are traced abstractly."""
+    sizes = []
+    for name, function in (("equality", equality), ("inequality", inequality)):
+        if function is None:
+            sizes.append(0)
+            continue
+        out = _traced(f"{label}{name}", function, arguments)
+        sizes.append(int(np.prod(out.shape)))
+    parts = [None if f is None else as_partial(f) for f in (equality, inequality)]
+    return Constraint(parts[0], parts[1], sizes[0], sizes[1])
+
+
+def constraints_of(
+    dynamics: Dynamics,
+    equality: Callable[..., Any] | None,
+    inequality: Callable[..., Any] | None,
+    terminal_equality: Callable[..., Any] | None,
+    terminal_inequality: Callable[..., Any] | None,
+) -> tuple[Constraint, Constraint]:
+    """The constraints of the stages and of the end."""
+    x, u = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu)
+    seen = jax.eval_shape(dynamics.observe, x, u)
+    return (
+        constraint_of(equality, inequality, (seen, u)),
+        constraint_of(terminal_equality, terminal_inequality, (seen,), "terminal_"),
+    )
+
+
 def from_function(
     f: Callable[[Array, Array], Array],
     *,
@@ -320,6 +425,10 @@ def from_function(
     terminal_cost: Callable[..., Any] | None = None,
     running_residual: Callable[..., Any] | None = None,
     terminal_residual: Callable[..., Any] | None = None,
+    equality: Callable[..., Any] | None = None,
+    inequality: Callable[..., Any] | None = None,
+    terminal_equality: Callable[..., Any] | None = None,
+    terminal_inequality: Callable[..., Any] | None = None,
     x_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
@@ -341,6 +450,10 @@ def from_function(
         terminal_cost: phi(x), a scalar.
         running_residual: r(x, u) (n,): adds 1/2 |r|^2 to the running cost.
         terminal_residual: r(x) (n,): adds 1/2 |r|^2 to the terminal cost.
+        equality: c(x, u) (m,), held at 0 at every stage k = 0..K-1.
+        inequality: g(x, u) (m,), held <= 0 at every stage.
+        terminal_equality: c(x) (m,), held at 0 at x_K.
+        terminal_inequality: g(x) (m,), held <= 0 at x_K.
         x_bounds: (lower, upper) on every x_k, k >= 1.
         u_bounds: (lower, upper) on every u_k.
         x_scatter: box from which initial states are drawn; by default the bounds, and within
@@ -356,11 +469,17 @@ def from_function(
     x_init = vector("x_init", x_init)
     nx = x_init.shape[0]
     bounds = box(nx, nu, x_bounds, u_bounds)
+    dynamics = FunctionDynamics(as_partial(f), dt, nx, nu)
+    constraint, terminal_constraint = constraints_of(
+        dynamics, equality, inequality, terminal_equality, terminal_inequality
+    )
     return checked(
         Problem(
-            dynamics=FunctionDynamics(as_partial(f), dt, nx, nu),
+            dynamics=dynamics,
             running=cost_of(running_cost, running_residual),
             terminal=cost_of(terminal_cost, terminal_residual),
+            constraint=constraint,
+            terminal_constraint=terminal_constraint,
             x_init=x_init,
             bounds=bounds,
             scatter=scatter_box(bounds, x_init, jnp.ones(nx), x_scatter, u_scatter),
@@ -439,9 +558,8 @@ def checked(problem: Problem) -> Problem:
                 f"bounds of {label} cross at element {i[-1]}: lower {float(lower[i])}, "
                 f"upper {float(upper[i])}. Give lower <= upper."
             )
-    outside = float(
-        jnp.max(jnp.maximum(bounds.x_lower - problem.x_init, problem.x_init - bounds.x_upper))
-    )
+    below, above = bounds.x_lower - problem.x_init, problem.x_init - bounds.x_upper
+    outside = float(jnp.maximum(below, above).max(initial=0.0))
     if bounds.x_lower.ndim == bounds.x_upper.ndim == 1 and outside > 1e-6:
         raise DraxError(
             f"x_init = {np.asarray(problem.x_init).tolist()} lies outside the bounds of x by "
@@ -480,6 +598,15 @@ def _check_shape(
     shape: tuple[int, ...] | None,
 ) -> None:
     """Trace a user's function abstractly; complain if it fails or returns another shape."""
+    seen = _traced(label, function, arguments).shape
+    if shape is not None and seen != shape:
+        expected = "a scalar" if shape == () else f"shape {shape}"
+        hint = " (a vector cost goes in as a residual)" if shape == () else ""
+        raise DraxError(f"{label} returned shape {seen}, but must return {expected}{hint}.")
+
+
+def _traced(label: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Shape and dtype of what a user's function returns, which must be one array of floats."""
     try:
         out = jax.eval_shape(function, *arguments)
     except DraxError:
@@ -490,10 +617,6 @@ def _check_shape(
             f"{label} failed when it was traced: {type(error).__name__}: {reason}. It must be a "
             "JAX function of its arguments (jax.numpy, no Python branches on values)."
         ) from error
-    seen = getattr(out, "shape", None)
-    if seen is None or not jnp.issubdtype(out.dtype, jnp.floating):
+    if getattr(out, "shape", None) is None or not jnp.issubdtype(out.dtype, jnp.floating):
         raise DraxError(f"{label} returned {out}: it must return one array of floats.")
-    if shape is not None and seen != shape:
-        expected = "a scalar" if shape == () else f"shape {shape}"
-        hint = " (a vector cost goes in as a residual)" if shape == () else ""
-        raise DraxError(f"{label} returned shape {seen}, but must return {expected}{hint}.")
+    return out

@@ -24,8 +24,16 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin, State, advance, evaluate
-from mjx_drax.precondition import Identity, feedback_gains
+from mjx_drax.langevin import (
+    FEASIBLE,
+    Info,
+    Langevin,
+    State,
+    advance,
+    evaluate,
+    feedback_gains,
+)
+from mjx_drax.precondition import Identity, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
 
 TRACKED = 1e-2
@@ -87,8 +95,8 @@ class Solution:
         problem: what was solved.
         solver: with which settings.
         seed: of the random keys.
-        trajectories: (chains, K, nx) and (chains, K, nu).
-        multipliers: lambda, (chains, K, ndx).
+        trajectories: knots, (chains, K, nx) and (chains, K, nu), and slacks of inequalities.
+        multipliers: lambda, of dynamics (chains, K, ndx) and constraints.
         gains: feedback K_k, (chains, K, nu, ndx).
         cost, max_defect, max_violation: of every chain, (chains,).
         converged_at: iteration since which max|h| < 1e-3, else -1, (chains,).
@@ -103,7 +111,7 @@ class Solution:
     solver: Langevin
     seed: int
     trajectories: Trajectory
-    multipliers: np.ndarray
+    multipliers: Multipliers
     gains: np.ndarray
     cost: np.ndarray
     max_defect: np.ndarray
@@ -219,10 +227,33 @@ def solve(
     Raises:
         DraxError: sizes that misfit, or a cost or dynamics that are not finite at any initial knot.
     """
-    if chains < 1:
-        raise DraxError(f"chains is {chains}: give at least 1.")
     problem = checked(problem)
     solver = solver or Langevin()
+    return _certified(problem, solver, seed, run(problem, chains, seed, solver, guess, progress))
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where the chains of a solve ended, before any replay."""
+
+    state: State
+    records: list[tuple[int, Info]]
+    converged_at: np.ndarray
+    compile_time: float
+    solve_time: float
+
+
+def run(
+    problem: Problem,
+    chains: int,
+    seed: int,
+    solver: Langevin,
+    guess: Trajectory | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """The iterations of `solve`, for problems that need no replay; the same arguments."""
+    if chains < 1:
+        raise DraxError(f"chains is {chains}: give at least 1.")
     total = int(solver.iterations) + int(solver.tail)
     if total < 1:
         raise DraxError(f"iterations + tail is {total}: give at least 1.")
@@ -252,8 +283,7 @@ def solve(
                 progress(done, total, info)
     except KeyboardInterrupt:
         pass  # the chains as they were at the last report
-    solve_time = time.perf_counter() - clock
-    return _certified(problem, solver, seed, state, records, converged_at, compile_time, solve_time)
+    return Run(state, records, converged_at, compile_time, time.perf_counter() - clock)
 
 
 def _initial_knots(
@@ -275,7 +305,7 @@ def _initial_knots(
         if not np.isfinite(array).all():
             raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
         knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
-    return Trajectory(*knots)
+    return Trajectory(knots[0], knots[1])
 
 
 def _require_finite(problem: Problem, info: Info) -> None:
@@ -289,35 +319,25 @@ def _require_finite(problem: Problem, info: Info) -> None:
             )
 
 
-def _certified(
-    problem: Problem,
-    solver: Langevin,
-    seed: int,
-    state: State,
-    records: list[tuple[int, Info]],
-    converged_at: np.ndarray,
-    compile_time: float,
-    solve_time: float,
-) -> Solution:
+def _certified(problem: Problem, solver: Langevin, seed: int, run: Run) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
+    state, records = run.state, run.records
     trajectories = jax.tree.map(np.asarray, state.trajectory)
     gains = np.asarray(state.gains)
     if isinstance(solver.preconditioner, Identity):  # it factorizes nothing: there are no gains yet
-        gains = np.asarray(
-            feedback_gains(problem, solver.barrier, state.trajectory, solver.levels(2))
-        )
+        gains = np.asarray(feedback_gains(solver, problem, state))
     info = records[-1][1]
     return Solution(
         problem=problem,
         solver=solver,
         seed=seed,
         trajectories=trajectories,
-        multipliers=np.asarray(state.multipliers),
+        multipliers=jax.tree.map(np.asarray, state.multipliers),
         gains=gains,
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
         max_violation=np.asarray(info.max_violation),
-        converged_at=converged_at,
+        converged_at=run.converged_at,
         died_at=np.asarray(state.died_at),
         open_loop=_replays(problem, trajectories, np.zeros_like(gains)),
         feedback=_replays(problem, trajectories, gains),
@@ -327,8 +347,8 @@ def _certified(
             "max_defect": np.stack([np.asarray(i.max_defect) for _, i in records]),
         },
         iterations=records[-1][0],
-        compile_time=compile_time,
-        solve_time=solve_time,
+        compile_time=run.compile_time,
+        solve_time=run.solve_time,
     )
 
 

@@ -1,0 +1,148 @@
+"""Three interchangeable ways to keep every iterate inside its bounds.
+
+`LogBarrier` adds rho b(z) to the cost, with a weight rho that decays over the solve and
+
+    b(z) = - sum_i [ log(z_i - lower_i) + log(upper_i - z_i) ].
+
+Two measures keep it finite under noise in float32: derivatives see a slack no smaller than a floor
+(so that 1/slack^2 cannot overflow), and a step may use up at most a fixed fraction of each
+element's own slack, so no element ever leaves its bounds. `Reflection` folds a step that would
+leave the box back into it, which keeps the law of free diffusion uniform; `Projection` clips it to
+the box. These two add nothing to the cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.tree_util import register_dataclass
+from jax.typing import ArrayLike
+
+from mjx_drax.problem import Box, Trajectory
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class LogBarrier:
+    """The barrier b(z), and a fraction-to-the-boundary rule for steps.
+
+    Attributes:
+        floor: smallest slack that derivatives see, in the variable's units.
+        fraction: share of an element's slack that one step may use (fraction to the boundary).
+    """
+
+    floor: ArrayLike = 1e-6
+    fraction: ArrayLike = 0.9
+
+    def value(self, box: Box, trajectory: Trajectory) -> Array:
+        """b(z) as one term per knot (u_k, x_{k+1}), (K,)."""
+
+        def log_slacks(z: Array, lower: Array, upper: Array) -> Array:
+            below, above = self._slack(z - lower), self._slack(upper - z)
+            return jnp.sum(jnp.log(below) + jnp.log(above), axis=-1)
+
+        logs = jax.tree.map(log_slacks, trajectory, *box.sides(trajectory))
+        knots = logs.x + logs.u
+        if logs.slack is not None:
+            knots = (knots + logs.slack.stage).at[-1].add(logs.slack.terminal)
+        return -knots
+
+    def derivatives(self, box: Box, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
+        """Gradient and diagonal of the Hessian of b, each shaped like the trajectory."""
+        lower, upper = box.sides(trajectory)
+
+        def gradient(z: Array, a: Array, b: Array) -> Array:
+            return _inverse(self._slack(b - z), b) - _inverse(self._slack(z - a), a)
+
+        def curvature(z: Array, a: Array, b: Array) -> Array:
+            return _inverse(self._slack(b - z), b) ** 2 + _inverse(self._slack(z - a), a) ** 2
+
+        return (
+            jax.tree.map(gradient, trajectory, lower, upper),
+            jax.tree.map(curvature, trajectory, lower, upper),
+        )
+
+    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+        """`new`, each element held back so as to keep 1 - fraction of the slack it had in `old`."""
+        lower, upper = box.sides(old)
+
+        def hold(z_old: Array, z_new: Array, a: Array, b: Array) -> Array:
+            return jnp.clip(
+                z_new, z_old - self.fraction * (z_old - a), z_old + self.fraction * (b - z_old)
+            )
+
+        return jax.tree.map(hold, old, new, lower, upper)
+
+    def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
+        """The nearest trajectory that keeps 1 % of the box's width away from its ends."""
+        return _inside(box, trajectory, 1e-2)
+
+    def _slack(self, slack: Array) -> Array:
+        """The slack that is differentiated: floored, and 1 (log 1 = 0) where there is no bound."""
+        return jnp.where(jnp.isinf(slack), 1.0, jnp.maximum(slack, self.floor))
+
+
+def _inverse(slack: Array, end: Array) -> Array:
+    """1 / slack where the bound is finite, else 0."""
+    return jnp.where(jnp.isinf(end), 0.0, 1.0 / slack)
+
+
+def _inside(box: Box, trajectory: Trajectory, margin: float) -> Trajectory:
+    """The nearest trajectory that keeps `margin` of the box's width away from its ends."""
+    lower, upper = box.sides(trajectory)
+
+    def inside(z: Array, a: Array, b: Array) -> Array:
+        gap = margin * jnp.where(jnp.isfinite(b - a), b - a, 1.0)
+        return jnp.clip(z, a + gap, b - gap)
+
+    return jax.tree.map(inside, trajectory, lower, upper)
+
+
+class _WithoutBarrier:
+    """What rules that only act on steps have in common: b(z) = 0."""
+
+    def value(self, box: Box, trajectory: Trajectory) -> Array:
+        """0 for every knot, (K,)."""
+        return jnp.zeros(trajectory.u.shape[0])
+
+    def derivatives(self, box: Box, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
+        """Zeros."""
+        zeros = jax.tree.map(jnp.zeros_like, trajectory)
+        return zeros, zeros
+
+    def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
+        """The nearest trajectory inside the box, ends included."""
+        return _inside(box, trajectory, 0.0)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Projection(_WithoutBarrier):
+    """A step that leaves the box ends at the nearest point of it."""
+
+    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+        """`new`, clipped to the box."""
+        return _inside(box, new, 0.0)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Reflection(_WithoutBarrier):
+    """A step that leaves the box is reflected at its walls, as often as it takes."""
+
+    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+        """`new`, folded back into the box."""
+
+        def fold(z: Array, a: Array, b: Array) -> Array:
+            width = jnp.where(jnp.isfinite(b - a), b - a, 1.0)
+            turned = jnp.mod(z - a, 2.0 * width)
+            both = a + jnp.where(turned > width, 2.0 * width - turned, turned)
+            one = jnp.where(jnp.isfinite(a), a + jnp.abs(z - a), b - jnp.abs(b - z))
+            free = jnp.isinf(a) & jnp.isinf(b)
+            folded = jnp.where(jnp.isfinite(b - a), both, jnp.where(free, z, one))
+            return jnp.clip(folded, a, b)  # rounding only
+
+        return jax.tree.map(fold, new, *box.sides(new))
