@@ -76,9 +76,9 @@ class LogBarrier:
 
         return jax.tree.map(hold, old, new, lower, upper)
 
-    def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
-        """The nearest trajectory that keeps 1 % of the box's width away from its ends."""
-        return _inside(box, trajectory, 1e-2)
+    def interior(self, box: Box, trajectory: Trajectory, margin: float = 1e-2) -> Trajectory:
+        """The nearest trajectory at least `margin` of the box's width away from its ends."""
+        return _inside(box, trajectory, margin)
 
     def _slack(self, slack: Array) -> Array:
         """The slack that is differentiated: floored, and 1 (log 1 = 0) where there is no bound."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_drax.derivatives import Autodiff
 from mjx_drax.dynamics import as_partial
 from mjx_drax.problem import Cost, cost_of
 
@@ -36,7 +37,7 @@ def bowl(z):
 
 
 def expand(cost):
-    return cost.expand(lambda dz: (Z + dz,), N)
+    return cost.expand(lambda dz: (Z + dz,), N, Autodiff(), jax.random.key(0))
 
 
 def test_residual_gives_jr_and_jj():

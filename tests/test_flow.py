@@ -78,7 +78,7 @@ def z(state):
 
 def assert_optimal(state, atol):
     np.testing.assert_allclose(z(state)[0], Z, atol=atol)
-    np.testing.assert_allclose(state.multipliers[0].ravel(), LAMBDA, atol=atol)
+    np.testing.assert_allclose(state.multipliers.dynamics[0].ravel(), LAMBDA, atol=atol)
 
 
 def test_the_program_is_the_one_that_the_solver_sees():
@@ -127,7 +127,7 @@ def test_the_papers_flow_without_noise_is_primal_dual_descent():
         point, multipliers = point - ALPHA * slope, multipliers + 2 * ALPHA * MU * h
         state = advance(PAPER, problem, state, i, i + 1)
         np.testing.assert_allclose(z(state)[0], point, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(state.multipliers[0].ravel(), multipliers, rtol=1e-12)
+        np.testing.assert_allclose(state.multipliers.dynamics[0].ravel(), multipliers, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -203,13 +203,14 @@ def test_the_noise_of_a_chain_depends_on_the_seed_and_not_on_its_neighbours():
 def test_a_chain_that_turns_nan_is_frozen_and_leaves_the_others_alone():
     problem = program()
     state = advance(NOISY, problem, start(NOISY, problem, chains=3), 0, 4)
-    sick = replace(state, multipliers=state.multipliers.at[1, 0, 0].set(jnp.nan))
+    bad = state.multipliers.dynamics.at[1, 0, 0].set(jnp.nan)
+    sick = replace(state, multipliers=replace(state.multipliers, dynamics=bad))
     healthy, ill = (advance(NOISY, problem, s, 4, 20) for s in (state, sick))
     np.testing.assert_array_equal(ill.died_at, [-1, 4, -1])
     np.testing.assert_array_equal(ill.alive, [True, False, True])
     np.testing.assert_array_equal(z(ill)[1], z(state)[1])  # where it last was finite
     np.testing.assert_array_equal(z(ill)[[0, 2]], z(healthy)[[0, 2]])
-    np.testing.assert_array_equal(ill.multipliers[::2], healthy.multipliers[::2])
+    np.testing.assert_array_equal(ill.multipliers.dynamics[::2], healthy.multipliers.dynamics[::2])
 
 
 def test_a_chain_that_starts_with_nan_knots_dies_at_once():
@@ -261,7 +262,7 @@ def test_numbers_change_without_recompiling():
         (replace(base, penalty=Geometric(10.0, 20.0)), make()),
         (replace(base, damping=Geometric(1.0, 0.1)), make()),
         (replace(base, barrier_weight=Geometric(1.0, 0.1, 1e-3)), make()),
-        (replace(base, barrier=replace(base.barrier, floor=1e-4, fraction=0.5)), make()),
+        (replace(base, bounds=replace(base.bounds, floor=1e-4, fraction=0.5)), make()),
     ]
     before, answers = advance._cache_size(), []
     for solver, problem in cases:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Trajectory, from_mjcf
+from mjx_drax.derivatives import Autodiff
 from mjx_drax.langevin import evaluate
-from mjx_drax.linearize import autodiff
+from mjx_drax.linearize import linearize
 from mjx_drax.models import path
 
 MODELS = ["pendulum", "cartpole", "acrobot"]
@@ -88,7 +89,9 @@ def test_step_and_jacobians_are_the_c_engines_in_float64(model):
         task = problem(model, horizon=K * 0.02, dt=0.02)
         x, u = drawn(task)
         at = replace(task, x_init=jnp.asarray(x[0]))
-        linear = jax.jit(autodiff)(at, Trajectory(jnp.asarray(x[1:]), jnp.asarray(u)))
+        knots = Trajectory(jnp.asarray(x[1:]), jnp.asarray(u))
+        keys = jax.random.split(jax.random.key(0), K)
+        linear = jax.jit(linearize)(at, knots, Autodiff(), keys)
         linear = jax.tree.map(np.asarray, linear)
     host, substeps = task.dynamics.mj_model, task.dynamics.substeps
     assert substeps == 2
