@@ -15,14 +15,22 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mjx_drax.bounds import LogBarrier as LogBarrier
+    from mjx_drax.bounds import Projection as Projection
+    from mjx_drax.bounds import Reflection as Reflection
+    from mjx_drax.derivatives import Autodiff as Autodiff
+    from mjx_drax.derivatives import Smoothed as Smoothed
     from mjx_drax.errors import DraxError as DraxError
     from mjx_drax.langevin import Langevin as Langevin
     from mjx_drax.mjcf import from_mjcf as from_mjcf
+    from mjx_drax.precondition import Diagonal as Diagonal
     from mjx_drax.precondition import GaussNewton as GaussNewton
     from mjx_drax.precondition import Identity as Identity
     from mjx_drax.problem import Problem as Problem
     from mjx_drax.problem import Trajectory as Trajectory
     from mjx_drax.problem import from_function as from_function
+    from mjx_drax.program import from_program as from_program
+    from mjx_drax.program import minimize as minimize
+    from mjx_drax.quasi_newton import LBFGS as LBFGS
     from mjx_drax.rendering import render as render
     from mjx_drax.schedules import Constant as Constant
     from mjx_drax.schedules import Geometric as Geometric
@@ -37,7 +45,15 @@ _HOME = {
     "Langevin": "langevin",
     "from_mjcf": "mjcf",
     "GaussNewton": "precondition",
+    "Diagonal": "precondition",
     "Identity": "precondition",
+    "LBFGS": "quasi_newton",
+    "Projection": "bounds",
+    "Reflection": "bounds",
+    "Autodiff": "derivatives",
+    "Smoothed": "derivatives",
+    "from_program": "program",
+    "minimize": "program",
     "Problem": "problem",
     "Trajectory": "problem",
     "from_function": "problem",

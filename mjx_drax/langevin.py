@@ -17,6 +17,7 @@ that turns non-finite is frozen where it last was finite and marked as diverged.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ from mjx_drax.dynamics import Static
 from mjx_drax.errors import DraxError
 from mjx_drax.precondition import (
     Bounds,
+    Diagonal,
     Direction,
     GaussNewton,
     Identity,
@@ -37,6 +39,7 @@ from mjx_drax.precondition import (
     augmented_lagrangian,
 )
 from mjx_drax.problem import Problem, Stagewise, Trajectory
+from mjx_drax.quasi_newton import LBFGS
 from mjx_drax.schedules import Constant, Geometric
 
 FEASIBLE = 1e-3
@@ -58,6 +61,7 @@ class State:
         trajectory: knots, (chains, K, nx) and (chains, K, nu).
         multipliers: lambda, of dynamics (chains, K, ndx) and constraints.
         gains: time-varying LQR feedback of the last factorization, (chains, K, nu, ndx).
+        memory: what the metric carries from one iteration to the next; () for most.
         key: random key of each chain, (chains,).
         alive: False from the moment a chain would have turned non-finite, (chains,).
         died_at: iteration at which it did, or -1, (chains,).
@@ -66,6 +70,7 @@ class State:
     trajectory: Trajectory
     multipliers: Multipliers
     gains: Array
+    memory: Any
     key: Array
     alive: Array
     died_at: Array
@@ -110,7 +115,7 @@ class Langevin:
     penalty: Geometric | Constant = Geometric(100.0, 1000.0, 1e4)
     damping: Geometric | Constant = Geometric(0.1, 0.1, 0.03)
     barrier_weight: Geometric | Constant = Geometric(0.1, 0.01, 1e-4)
-    preconditioner: GaussNewton | Identity = field(default_factory=GaussNewton)
+    preconditioner: GaussNewton | Diagonal | Identity | LBFGS = field(default_factory=GaussNewton)
     bounds: Bounds = field(default_factory=LogBarrier)
     adjusted: bool = field(default=False, metadata=Static)
 
@@ -147,6 +152,7 @@ class Langevin:
                 Stagewise(jnp.zeros((chains, K, m)), jnp.zeros((chains, m_end))),
             ),
             gains=jnp.zeros((chains, K, nu, ndx)),
+            memory=jax.vmap(self.preconditioner.memory, in_axes=(None, 0))(problem, inside),
             key=jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains)),
             alive=jnp.ones(chains, bool),
             died_at=jnp.full(chains, -1),
@@ -163,7 +169,9 @@ class Langevin:
         )
         levels = self.levels(t)
 
-        def direction(trajectory: Trajectory, multipliers: Multipliers, key: Array) -> Direction:
+        def direction(
+            trajectory: Trajectory, multipliers: Multipliers, key: Array, memory: Any
+        ) -> Direction:
             return self.preconditioner.direction(
                 problem,
                 self.bounds,
@@ -171,9 +179,12 @@ class Langevin:
                 multipliers,
                 levels,
                 jax.random.fold_in(key, iteration),
+                memory,
             )
 
-        directions = jax.vmap(direction)(state.trajectory, state.multipliers, state.key)
+        directions = jax.vmap(direction)(
+            state.trajectory, state.multipliers, state.key, state.memory
+        )
 
         def diffuse(state: State) -> tuple[Trajectory, Array]:
             def move(
@@ -186,7 +197,7 @@ class Langevin:
                 new = self._moved(problem, old, change)
                 if not self.adjusted:
                     return new
-                back = direction(new, multipliers, key).drift
+                back = direction(new, multipliers, key, ()).drift
                 ratio = self._log_acceptance(problem, old, new, multipliers, to.drift, back, levels)
                 u = jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, iteration), 1))
                 inside = problem.bounds.violation(jax.tree.map(jnp.add, old, change)) == 0.0
@@ -226,7 +237,13 @@ class Langevin:
             state.multipliers,
             directions.multipliers,
         )
-        new = replace(state, trajectory=trajectory, multipliers=multipliers, gains=directions.gains)
+        new = replace(
+            state,
+            trajectory=trajectory,
+            multipliers=multipliers,
+            gains=directions.gains,
+            memory=directions.memory,
+        )
         return _keep_finite(state, new, iteration)
 
     def _log_acceptance(
@@ -283,8 +300,8 @@ def _per_chain(values: Array, like: Array) -> Array:
 def _keep_finite(old: State, new: State, iteration: Array) -> State:
     """The new state, where chains that would turn non-finite stay what they were."""
 
-    def numbers(state: State) -> tuple[Trajectory, Multipliers, Array]:
-        return state.trajectory, state.multipliers, state.gains
+    def numbers(state: State) -> tuple[Trajectory, Multipliers, Array, Any]:
+        return state.trajectory, state.multipliers, state.gains, state.memory
 
     finite = jnp.stack(
         [
@@ -293,11 +310,11 @@ def _keep_finite(old: State, new: State, iteration: Array) -> State:
         ]
     ).all(0)
     alive = old.alive & finite
-    trajectory, multipliers, gains = jax.tree.map(
+    trajectory, multipliers, gains, memory = jax.tree.map(
         lambda a, b: jnp.where(_per_chain(alive, a), a, b), numbers(new), numbers(old)
     )
     died_at = jnp.where(old.alive & ~finite, iteration, old.died_at)
-    return State(trajectory, multipliers, gains, old.key, alive, died_at)
+    return State(trajectory, multipliers, gains, memory, old.key, alive, died_at)
 
 
 @jax.jit

@@ -59,12 +59,22 @@ class Direction:
         noise: n, for sigma = 1.
         multipliers: their rate r.
         gains: feedback that comes with the metric, (K, nu, ndx); zeros if none does.
+        memory: what the metric wants to see again in the next iteration.
     """
 
     drift: Trajectory
     noise: Trajectory
     multipliers: Multipliers
     gains: Array
+    memory: Any = ()
+
+
+class Memoryless:
+    """A metric that is made anew in every iteration."""
+
+    def memory(self, problem: Problem, trajectory: Trajectory) -> tuple[()]:
+        """Nothing."""
+        return ()
 
 
 def residuals(problem: Problem, trajectory: Trajectory) -> tuple[Array, Stagewise]:
@@ -110,7 +120,7 @@ def _penalized(
 
 @register_dataclass
 @dataclass(frozen=True)
-class Identity:
+class Identity(Memoryless):
     """M = I: the flow of the paper as printed, with alpha = dt / 2.
 
     X <- X - alpha grad L_mu + sigma sqrt(2 alpha) xi,  lambda <- lambda + 2 alpha mu h.
@@ -130,9 +140,9 @@ class Identity:
         multipliers: Multipliers,
         levels: Levels,
         key: Array,
+        memory: Any = (),
     ) -> Direction:
         """Drift, noise and multiplier rate."""
-        dynamics = problem.dynamics
         key_noise, key_samples = jax.random.split(key)
         if self.derivatives is None:
             slope = jax.grad(lambda z: jnp.sum(_penalized(problem, z, multipliers, levels)))(
@@ -143,13 +153,22 @@ class Identity:
             slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
         walls, _ = bounds.derivatives(problem.bounds, trajectory)
         drift = jax.tree.map(lambda g, b: -(g + levels.barrier * b), slope, walls)
-        leaves, tree = jax.tree.flatten(trajectory)
-        keys = jax.random.split(key_noise, len(leaves))
-        noise = [jax.random.normal(k, z.shape, z.dtype) for k, z in zip(keys, leaves, strict=True)]
-        h, values = residuals(problem, trajectory)
-        rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, Multipliers(h, values))
-        no_gains = jnp.zeros((problem.horizon, dynamics.nu, dynamics.ndx), h.dtype)
-        return Direction(drift, jax.tree.unflatten(tree, noise), rate, no_gains)
+        h = Multipliers(*residuals(problem, trajectory))
+        rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, h)
+        return Direction(drift, _white(trajectory, key_noise), rate, _no_gains(problem))
+
+
+def _white(trajectory: Trajectory, key: Array) -> Trajectory:
+    """Standard normal numbers in the shape of a trajectory."""
+    leaves, tree = jax.tree.flatten(trajectory)
+    keys = jax.random.split(key, len(leaves))
+    noise = [jax.random.normal(k, z.shape, z.dtype) for k, z in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(tree, noise)
+
+
+def _no_gains(problem: Problem) -> Array:
+    """Zero feedback gains (K, nu, ndx)."""
+    return jnp.zeros((problem.horizon, problem.dynamics.nu, problem.dynamics.ndx))
 
 
 @register_dataclass
@@ -238,7 +257,58 @@ def _slacks(trajectory: Trajectory, rows: Stagewise) -> Stagewise | None:
 
 @register_dataclass
 @dataclass(frozen=True)
-class GaussNewton:
+class Diagonal(Memoryless):
+    """M = diag(H + mu J'J) + rho b'' + delta: each variable scaled by its own curvature.
+
+    Multipliers move as in the paper's flow, r = 2 mu h.
+    """
+
+    derivatives: Differentiator = field(default_factory=Autodiff)
+
+    def direction(
+        self,
+        problem: Problem,
+        bounds: Bounds,
+        trajectory: Trajectory,
+        multipliers: Multipliers,
+        levels: Levels,
+        key: Array,
+        memory: Any = (),
+    ) -> Direction:
+        """Drift, noise and multiplier rate, without any factorization."""
+        key_noise, key_model = jax.random.split(key)
+        model = expand(problem, trajectory, self.derivatives, key_model)
+        slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
+        walls, curvature = bounds.derivatives(problem.bounds, trajectory)
+        M = jax.tree.map(
+            lambda m, c: m + levels.barrier * c + levels.damping,
+            _diagonal(model, trajectory, levels.penalty),
+            curvature,
+        )
+        drift = jax.tree.map(lambda g, b, m: -(g + levels.barrier * b) / m, slope, walls, M)
+        noise = jax.tree.map(lambda xi, m: xi / jnp.sqrt(m), _white(trajectory, key_noise), M)
+        h = Multipliers(model.dynamics.h, model.residual)
+        rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, h)
+        return Direction(drift, noise, rate, _no_gains(problem))
+
+
+def _diagonal(model: Model, trajectory: Trajectory, penalty: Array) -> Trajectory:
+    """The diagonal of H + mu J'J, in the shape of a trajectory."""
+    ndx = model.dynamics.h.shape[-1]
+    squares = jnp.sum(jnp.square(model.stage), axis=1)
+    x = jnp.einsum("kii->ki", model.cost.Hxx)
+    x = x.at[1:].add(penalty)  # dh_k / dx_{k+1} = -I
+    x = x.at[:-1].add(penalty * (jnp.sum(jnp.square(model.dynamics.A), axis=1) + squares[:, :ndx]))
+    x = x.at[-1].add(penalty * jnp.sum(jnp.square(model.terminal), axis=0))
+    u = jnp.einsum("kii->ki", model.cost.Huu)
+    u = u + penalty * (jnp.sum(jnp.square(model.dynamics.B), axis=1) + squares[:, ndx:])
+    slack = jax.tree.map(lambda s: jnp.full_like(s, penalty), trajectory.slack)
+    return Trajectory(x[1:], u, slack)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class GaussNewton(Memoryless):
     """M = H + mu J'J + delta I, with H the Gauss-Newton model of c plus the barrier's diagonal.
 
     The multipliers follow the predicted, noise-free residual: r = mu (h + J d).
@@ -254,6 +324,7 @@ class GaussNewton:
         multipliers: Multipliers,
         levels: Levels,
         key: Array,
+        memory: Any = (),
     ) -> Direction:
         """Drift, noise and multiplier rate, from one block-tridiagonal factorization."""
         key_model, key_noise, key_slack = jax.random.split(key, 3)

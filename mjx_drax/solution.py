@@ -33,7 +33,7 @@ from mjx_drax.langevin import (
     evaluate,
     feedback_gains,
 )
-from mjx_drax.precondition import Identity, Multipliers
+from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
 
 TRACKED = 1e-2
@@ -324,7 +324,7 @@ def _certified(problem: Problem, solver: Langevin, seed: int, run: Run) -> Solut
     state, records = run.state, run.records
     trajectories = jax.tree.map(np.asarray, state.trajectory)
     gains = np.asarray(state.gains)
-    if isinstance(solver.preconditioner, Identity):  # it factorizes nothing: there are no gains yet
+    if not isinstance(solver.preconditioner, GaussNewton):  # the others bring no gains
         gains = np.asarray(feedback_gains(solver, problem, state))
     info = records[-1][1]
     return Solution(
