@@ -17,6 +17,7 @@ that turns non-finite is frozen where it last was finite and marked as diverged.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -158,8 +159,14 @@ class Langevin:
             died_at=jnp.full(chains, -1),
         )
 
-    def step(self, problem: Problem, state: State, iteration: ArrayLike) -> State:
-        """One iteration of every chain; the schedules are read at `iteration`."""
+    def step(
+        self, problem: Problem, state: State, iteration: ArrayLike, tail: bool = True
+    ) -> State:
+        """One iteration of every chain; the schedules are read at `iteration`.
+
+        A caller that knows that there is no tail says so with tail=False (static): the choice
+        between noise and line search, which a GPU waits for, is then left out.
+        """
         iteration = jnp.asarray(iteration)
         noisy = iteration < self.iterations
         t = jnp.where(
@@ -231,7 +238,10 @@ class Langevin:
 
             return jax.vmap(search)(state.trajectory, state.multipliers, directions)
 
-        trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
+        if tail:
+            trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
+        else:
+            trajectory, size = diffuse(state)
         multipliers = jax.tree.map(
             lambda m, rate: m + _per_chain(size, m) * rate,
             state.multipliers,
@@ -327,16 +337,21 @@ def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     return jax.vmap(one)(trajectory)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="tail")
 def advance(
-    solver: Langevin, problem: Problem, state: State, start: ArrayLike, stop: ArrayLike
+    solver: Langevin,
+    problem: Problem,
+    state: State,
+    start: ArrayLike,
+    stop: ArrayLike,
+    tail: bool = True,
 ) -> State:
-    """Iterations start..stop-1 of every chain.
+    """Iterations start..stop-1 of every chain; `tail` as in `Langevin.step`.
 
     Both ends are traced: any number of iterations runs the same compiled loop, and none at all
     (start = stop) just compiles it.
     """
-    return jax.lax.fori_loop(start, stop, lambda i, s: solver.step(problem, s, i), state)
+    return jax.lax.fori_loop(start, stop, lambda i, s: solver.step(problem, s, i, tail), state)
 
 
 @jax.jit
