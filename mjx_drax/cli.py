@@ -49,6 +49,8 @@ _PROBLEM_NAMES = (
     "guess",
 )
 
+REPRODUCIBLE = ("phase-portrait", "convergence", "bug-trap", "parallel-table", "open-questions")
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status is 0 if it did what was asked for, 1 or 2 if not."""
@@ -103,6 +105,23 @@ def _parser() -> argparse.ArgumentParser:
     measuring.add_argument("--chains", type=_positive, metavar="N", help="default: each task's own")
     measuring.add_argument("--out", metavar="DIR", default="out/benchmark")
     measuring.set_defaults(run=_benchmark)
+
+    reproducing = commands.add_parser(
+        "reproduce",
+        help="a figure or table of the paper",
+        description="Redo a figure or table of the paper: writes NAME.png and NAME.json.",
+    )
+    reproducing.add_argument(
+        "name", metavar="NAME", choices=REPRODUCIBLE, help=", ".join(REPRODUCIBLE)
+    )
+    reproducing.add_argument("--out", metavar="DIR", default="out/reproduce")
+    reproducing.add_argument(
+        "--chains", type=_positive, metavar="N", help="number of chains; at most so many problems"
+    )
+    reproducing.add_argument(
+        "--iterations", type=_positive, metavar="K", help="instead of the published or usual number"
+    )
+    reproducing.set_defaults(run=_reproduce)
     return parser
 
 
@@ -171,6 +190,16 @@ def _benchmark(options: argparse.Namespace) -> int:
     )
     say(f"written to {benchmark.save(rows, folder)}")
     return 0 if all(row["certified"] for row in rows) else 1
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    from mjx_drax import reproduce
+
+    _cache_compilations()
+    numbers = reproduce.run(options.name, options.out, options.chains, options.iterations)
+    say(reproduce.table(numbers))
+    say(f"written to {options.out}/: {options.name}.png, {options.name}.json")
+    return 0
 
 
 def _task(options: argparse.Namespace) -> tuple[Problem, Langevin, int, Callable[..., Any] | None]:

@@ -1,0 +1,230 @@
+"""Nonlinear programs that are not trajectories: KKT points in closed form, and scipy's.
+
+min c(x)   s.t.   h(x) = 0,   g(x) <= 0,   lower <= x <= upper
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import NonlinearConstraint
+from scipy.optimize import minimize as scipy_minimize
+
+from mjx_drax import (
+    Constant,
+    DraxError,
+    Geometric,
+    Identity,
+    Langevin,
+    Trajectory,
+    from_function,
+)
+from mjx_drax.langevin import advance
+from mjx_drax.program import from_program, minimize
+
+
+@pytest.fixture(autouse=True)
+def _double():
+    with jax.enable_x64(True):
+        yield
+
+
+# min 1/2 x'Qx + q'x   s.t.   Ax = b: three unknowns, two constraints, both multipliers far from 0
+Q = np.array([[3.0, 1.0, 0.0], [1.0, 2.0, -0.5], [0.0, -0.5, 1.0]])
+q = np.array([1.0, -2.0, 0.5])
+A = np.array([[1.0, 1.0, 1.0], [1.0, -2.0, 0.0]])
+b = np.array([1.0, 0.5])
+X, LAMBDA = np.split(
+    np.linalg.solve(np.block([[Q, A.T], [A, np.zeros((2, 2))]]), np.append(-q, b)), [3]
+)
+MU = 2.0
+ALPHA = 0.2 / np.linalg.eigvalsh(Q + MU * A.T @ A).max()
+PLATT_BARR = Langevin(
+    preconditioner=Identity(),
+    noise=Constant(0.0),
+    penalty=Constant(MU),
+    step_size=ALPHA,
+    iterations=5000,
+    tail=0,
+)
+
+
+def quadratic(x):
+    return 0.5 * x @ Q @ x + q @ x
+
+
+@pytest.fixture(scope="module")
+def linear():
+    with jax.enable_x64(True):
+        return from_program(3, cost=quadratic, equality=lambda x: A @ x - b)
+
+
+@pytest.mark.parametrize("solver", [Langevin(), PLATT_BARR], ids=["gauss-newton", "platt-barr"])
+def test_every_chain_reaches_the_kkt_point(linear, solver):
+    assert np.abs(LAMBDA).min() > 0.2
+    found = minimize(linear, chains=3, solver=solver)
+    np.testing.assert_allclose(found.x, np.tile(X, (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(found.equality, np.tile(LAMBDA, (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(found.cost, quadratic(X), atol=1e-5)
+    assert found.inequality.shape == (3, 0)
+    assert found.max_defect.max() < 1e-6
+
+
+def test_a_residual_is_half_its_square(linear):
+    root = np.linalg.cholesky(Q).T  # |R x + R^-T q|^2 / 2 = c(x) + a constant
+    offset = np.linalg.solve(root.T, q)
+    program = from_program(3, residual=lambda x: root @ x + offset, equality=lambda x: A @ x - b)
+    for x in np.random.default_rng(0).normal(size=(3, 3)):
+        at = Trajectory(jnp.zeros((1, 0)), jnp.asarray(x)[None])
+        assert program.cost(at) == pytest.approx(linear.cost(at) + offset @ offset / 2)
+        assert program.max_defect(at) == pytest.approx(np.abs(A @ x - b).max())
+
+
+def test_without_noise_the_papers_flow_is_the_differential_multiplier_method(linear):
+    x, multipliers = np.array([1.0, -1.0, 2.0]), np.zeros(2)
+    knots = Trajectory(jnp.zeros((1, 1, 0)), jnp.asarray(x)[None, None])
+    state = PLATT_BARR.init(linear, knots, jax.random.key(0))
+    for i in range(25):
+        h = A @ x - b
+        slope = Q @ x + q + A.T @ (multipliers + MU * h)
+        x, multipliers = x - ALPHA * slope, multipliers + 2 * ALPHA * MU * h
+        state = advance(PLATT_BARR, linear, state, i, i + 1)
+        np.testing.assert_allclose(state.trajectory.u[0, 0], x, rtol=1e-12)
+        rows = state.multipliers.constraints.stage[0, 0]
+        np.testing.assert_allclose(rows, multipliers, rtol=1e-12)
+
+
+def test_inequalities_and_bounds_active_and_not():
+    # The answer comes first; q is whatever makes it stationary: Qx + q + G'nu - below + above = 0
+    x = np.array([0.0, 0.7, 2.0])  # at its lower bound, free, at its upper bound
+    G = np.array([[1.0, 2.0, -1.0], [0.5, -1.0, 1.0]])
+    nu, limit = np.array([0.8, 0.0]), G @ x + np.array([0.0, 0.6])  # first row active, second not
+    walls = np.array([-0.9, 0.0, 1.1])
+    linear = -(Q @ x + G.T @ nu + walls)
+
+    def cost(x):
+        return 0.5 * x @ Q @ x + linear @ x
+
+    program = from_program(
+        3, cost=cost, inequality=lambda x: G @ x - limit, bounds=([0.0, -4.0, -4.0], [4.0, 4.0, 2])
+    )
+    solver = Langevin(tail=150, barrier_weight=Geometric(0.1, 0.01, 1e-7))
+    found = minimize(program, chains=4, solver=solver)
+    np.testing.assert_allclose(found.x, np.tile(x, (4, 1)), atol=1e-5)
+    np.testing.assert_allclose(found.inequality, np.tile(nu, (4, 1)), atol=1e-5)
+    assert (found.inequality > 0).all()
+    slack = limit - found.x @ G.T
+    np.testing.assert_allclose(found.inequality * slack, 0, atol=2e-5)
+    assert found.max_defect.max() < 2e-5
+
+
+def hs071():
+    """Hock and Schittkowski's problem 71; x = (1, 4.743, 3.821, 1.379), c = 17.0140."""
+    return {
+        "cost": lambda x: x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2],
+        "equality": lambda x: jnp.sum(jnp.square(x))[None] - 40.0,
+        "inequality": lambda x: 25.0 - jnp.prod(x)[None],
+    }
+
+
+def test_hs071_and_its_multipliers_are_those_of_the_book_and_of_scipy():
+    parts = hs071()
+    program = from_program(4, **parts, bounds=(1.0, 5.0))
+    solver = Langevin(tail=200, barrier_weight=Geometric(0.1, 0.01, 1e-6))
+    found = minimize(program, chains=16, solver=solver)
+    best = found.best_chain
+    np.testing.assert_allclose(found.best, [1.0, 4.74299963, 3.82114998, 1.37940829], atol=1e-3)
+    assert found.cost[best] == pytest.approx(17.0140173, abs=2e-3)
+    assert (np.abs(found.cost - 17.0140173) < 2e-3).mean() > 0.5
+
+    def constraint(name, ends):
+        function = jax.jit(parts[name])
+        return NonlinearConstraint(function, *ends, jac=jax.jit(jax.jacobian(parts[name])))
+
+    reference = scipy_minimize(
+        jax.jit(parts["cost"]),
+        [1.0, 5.0, 5.0, 1.0],
+        jac=jax.jit(jax.grad(parts["cost"])),
+        bounds=[(1.0, 5.0)] * 4,
+        constraints=[constraint("equality", (0, 0)), constraint("inequality", (-np.inf, 0))],
+        method="trust-constr",
+        options={"gtol": 1e-9, "xtol": 1e-9, "barrier_tol": 1e-9},
+    )
+    np.testing.assert_allclose(found.best, reference.x, atol=1e-3)
+    np.testing.assert_allclose(found.equality[best], reference.v[0], atol=1e-3)
+    np.testing.assert_allclose(found.inequality[best], reference.v[1], atol=1e-3)
+
+
+def test_noise_finds_the_global_minimum_of_several():
+    # On the unit circle c = cos(3 angle) + x_2 has three minima
+    def cost(x):
+        return 4.0 * x[0] ** 3 - 3.0 * x[0] + x[1]
+
+    program = from_program(
+        2, cost=cost, equality=lambda x: (x @ x - 1.0)[None], scatter=(-1.5, 1.5)
+    )
+    angle = np.linspace(0, 2 * np.pi, 100_001)
+    curve = np.cos(3 * angle) + np.sin(angle)
+    minima = (curve[1:-1] < curve[:-2]) & (curve[1:-1] < curve[2:])
+    assert minima.sum() == 3
+    lowest = curve.min()
+    noisy = Langevin(
+        preconditioner=Identity(),
+        noise=Geometric(1.0, 0.1),
+        penalty=Constant(10.0),
+        step_size=0.01,
+        iterations=4000,
+        tail=200,
+    )
+    shares = []
+    for solver in (noisy, replace(noisy, noise=Constant(0.0))):
+        found = minimize(program, chains=128, solver=solver)
+        shares.append(((found.cost < lowest + 0.01) & (found.max_defect < 1e-3)).mean())
+        assert found.cost[found.best_chain] == pytest.approx(lowest, abs=2e-3)
+    assert shares[0] > shares[1] + 0.2, shares
+    assert shares[0] > 0.7, shares
+
+
+def test_a_guess_is_where_the_chains_start(linear):
+    still = replace(PLATT_BARR, step_size=0.0, iterations=1)
+    one, each = np.arange(3.0), np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(
+        minimize(linear, chains=2, solver=still, guess=one).x, np.tile(one, (2, 1))
+    )
+    np.testing.assert_array_equal(minimize(linear, chains=2, solver=still, guess=each).x, each)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"cost": lambda x: x}, r"cost returned shape \(2,\).*must return a scalar"),
+        ({"cost": jnp.sum, "bounds": ([0.0, 3.0], [1.0, 2.0])}, "cross at element 1.*3.*2"),
+        ({}, "program has no cost"),
+        ({"cost": jnp.sum, "bounds": ([0.0] * 3, 1.0)}, r"\(2,\)"),
+        ({"cost": jnp.sum, "equality": lambda x: x @ jnp.ones(5)}, "equality failed"),
+        ({"cost": jnp.sum, "inequality": lambda x: x > 0}, "inequality returned"),
+    ],
+)
+def test_misfits_are_named(arguments, message):
+    with pytest.raises(DraxError, match=message):
+        from_program(2, **arguments)
+
+
+def test_minimize_names_what_it_cannot_take(linear):
+    with pytest.raises(DraxError, match=r"guess\.u.*2.*3"):
+        minimize(linear, chains=2, guess=np.ones(2))
+    trajectory = from_function(
+        lambda x, u: x + u, x_init=[0.0], nu=1, dt=1.0, horizon=1.0, terminal_cost=lambda x: x @ x
+    )
+    with pytest.raises(DraxError, match=r"trajectory problem: use mjx_drax\.solve"):
+        minimize(trajectory)
+    with pytest.raises(DraxError, match="cost of program is nan"):
+        minimize(from_program(1, cost=lambda x: jnp.log(-1.0 - x[0] ** 2)), chains=2)
+
+
+@pytest.mark.xfail(reason="IndexError from jax instead", raises=IndexError)
+def test_a_guess_that_is_a_number_is_named(linear):
+    with pytest.raises(DraxError, match="guess"):
+        minimize(linear, chains=2, guess=0.0)

@@ -1,0 +1,119 @@
+"""The paper's figures and table at the smallest sizes that still say something."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax import Constant, reproduce
+from mjx_drax.cli import REPRODUCIBLE, main
+from mjx_drax.errors import DraxError
+from mjx_drax.reproduce import EXPERIMENTS, PENDULUM_FLOW, TRAP_FLOW
+
+
+def figure_is_drawn(figure):
+    figure.canvas.draw()
+    return all(axes.has_data() or not axes.axison for axes in figure.axes)
+
+
+def test_command_line_knows_every_experiment():
+    assert tuple(EXPERIMENTS) == REPRODUCIBLE
+
+
+def test_flows_are_the_printed_one():
+    for flow in (PENDULUM_FLOW, TRAP_FLOW):
+        assert flow.iterations == 20_000
+        assert flow.tail == 0
+    assert PENDULUM_FLOW.penalty == Constant(10.0)
+
+
+def test_phase_portrait_is_written_and_its_numbers_are_measured(tmp_path, capsys):
+    arguments = f"reproduce phase-portrait --chains 4 --iterations 60 --out {tmp_path}".split()
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "| preconditioned | 200 | 4 | 100.0% | 100.0% |" in out
+    assert "| paper's flow | 60 | 4 | 0.0% | 0.0% |" in out
+    assert (tmp_path / "phase-portrait.png").stat().st_size > 10_000
+    numbers = json.loads((tmp_path / "phase-portrait.json").read_text())
+    flow, preconditioned = numbers["rows"]
+    assert flow["best cost"] is None
+    np.testing.assert_allclose(preconditioned["best cost"], 0.031774, rtol=2e-3)
+    assert numbers["settings"]["paper's flow"]["penalty"] == {"type": "Constant", "value": 10.0}
+    assert numbers["settings"]["paper's flow"]["iterations"] == 60
+    assert numbers["device"]
+    assert numbers["versions"]["jax"] == jax.__version__
+
+
+def test_convergence_has_a_curve_for_every_penalty():
+    numbers, figure = reproduce.convergence(chains=4, iterations=400, penalties=(0.01, 10.0))
+    weak, strong = numbers["rows"]
+    assert strong["median |h|²"] < 1e-2 * weak["median |h|²"]
+    assert weak["step size"] == strong["step size"] == 0.025
+    series = numbers["series"]
+    assert len(series["iteration"]) == len(series["mu=10"]["median"]) == 201
+    assert series["mu=10"]["median"][0] == series["mu=0.01"]["median"][0]  # the same knots
+    assert figure_is_drawn(figure)
+
+
+def test_bug_trap_gives_every_method_the_same_budget():
+    numbers, figure = reproduce.bug_trap(chains=4, iterations=30, longer=2)
+    budgets = {row["method"]: row["iterations"] for row in numbers["rows"]}
+    long = {name for name in budgets if name.endswith("2×")}
+    assert len(long) == 3
+    assert {budgets[name] for name in long} == {60}
+    assert {budgets[name] for name in set(budgets) - long} == {30}
+    assert numbers["settings"]["gradient descent"]["noise"]["start"] == 0.0
+    assert figure_is_drawn(figure)
+
+
+def test_parallel_table_solves_a_problem_for_each_initial_state():
+    numbers, figure = reproduce.parallel_table(chains=4, iterations=50, sizes=(4, 8))
+    assert [(row["N"], row["x_init"]) for row in numbers["rows"]] == [
+        (4, "random"),
+        (4, "hanging"),
+    ]
+    hanging = numbers["rows"][-1]
+    assert hanging["preconditioned: rollout upright"] == 1.0
+    assert hanging["paper's flow: rollout upright"] == 0.0  # not after 50 iterations
+    assert hanging["preconditioned: time [s]"] > 0
+    assert "| 4 | hanging |" in reproduce.table(numbers)
+    assert figure_is_drawn(figure)
+
+
+def test_batched_problems_start_where_they_should():
+    problem, solver = reproduce._task("pendulum")
+    starts = jnp.array([[3.1, 0.0], [3.0, 0.2], [-3.1, 0.0], [3.2, -0.1]])
+    keys = jax.random.split(jax.random.key(0), 4)
+    trajectory, info = reproduce._many(solver, problem, starts, keys, 200)
+    for i in range(4):
+        own = problem.with_x_init(starts[i])
+        one = jax.tree.map(lambda a, i=i: a[i], trajectory)
+        assert own.max_defect(one) < 1e-3
+        np.testing.assert_allclose(own.max_defect(one), info.max_defect[i], atol=1e-6)
+    assert reproduce._reaches(problem, trajectory, starts)[0]
+
+
+def test_open_questions_answers_each_of_them():
+    numbers, figure = reproduce.open_questions(chains=4, iterations=20, limit=80, pairs=(6,))
+    assert numbers["preconditioning"][0]["method"] == "identity"
+    assert numbers["preconditioning"][-1]["method"] == "Gauss-Newton"
+    schedules = [row["annealing"] for row in numbers["annealing"]]
+    assert {"geometric", "linear", "adaptive", "no noise"} <= set(schedules)
+    sigma = {name: curve["sigma"] for name, curve in numbers["sigmas"].items()}
+    assert sigma["geometric"][0] == sigma["adaptive"][0] == 30.0
+    assert np.all(np.diff(sigma["adaptive"]) < 0)
+    assert max(sigma["no noise"]) == 0
+    exact, *sampled = numbers["gradients"]
+    assert exact["reaches goal"] == sampled[-1]["reaches goal"] == 1.0
+    assert figure_is_drawn(figure)
+
+
+def test_unknown_names_and_folders_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["reproduce", "phase"])
+    assert "phase-portrait" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DraxError, match="cannot write"):
+        reproduce.run("convergence", tmp_path / "file")
