@@ -13,7 +13,7 @@ the box. These two add nothing to the cost.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -102,30 +102,52 @@ def _inside(box: Box, trajectory: Trajectory, margin: float) -> Trajectory:
 
 
 class _WithoutBarrier:
-    """What rules that only act on steps have in common: b(z) = 0."""
+    """What rules that only act on steps have in common: no barrier on states and controls.
+
+    Slack variables keep theirs, which is what makes an inequality act before it is violated.
+    """
 
     def value(self, box: Box, trajectory: Trajectory) -> Array:
-        """0 for every knot, (K,)."""
-        return jnp.zeros(trajectory.u.shape[0])
+        """b of the slack variables as one term per knot, (K,)."""
+        return LogBarrier().value(_free(box), trajectory)
 
     def derivatives(self, box: Box, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
-        """Zeros."""
-        zeros = jax.tree.map(jnp.zeros_like, trajectory)
-        return zeros, zeros
+        """Gradient and diagonal of the Hessian of b: zeros but for the slack variables."""
+        return LogBarrier().derivatives(_free(box), trajectory)
 
     def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
         """The nearest trajectory inside the box, ends included."""
         return _inside(box, trajectory, 0.0)
 
 
+def _free(box: Box) -> Box:
+    """A box without ends."""
+    ends = (
+        (box.x_lower, -jnp.inf),
+        (box.x_upper, jnp.inf),
+        (box.u_lower, -jnp.inf),
+        (box.u_upper, jnp.inf),
+    )
+    return Box(*(jnp.full_like(end, value) for end, value in ends))
+
+
+def _with_slack_confined(box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+    """`new`, its slack variables held by the barrier's rule."""
+    return replace(new, slack=LogBarrier().confine(_free(box), old, new).slack)
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Projection(_WithoutBarrier):
-    """A step that leaves the box ends at the nearest point of it."""
+    """A step that leaves the box ends at the nearest point of it.
+
+    Meant for `Identity` and `Diagonal`: a Newton step that is clipped afterwards need not descend,
+    so with `GaussNewton` and active bounds the log barrier finds better answers.
+    """
 
     def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
         """`new`, clipped to the box."""
-        return _inside(box, new, 0.0)
+        return _inside(box, _with_slack_confined(box, old, new), 0.0)
 
 
 @register_dataclass
@@ -137,7 +159,7 @@ class Reflection(_WithoutBarrier):
         """`new`, folded back into the box."""
 
         def fold(z: Array, a: Array, b: Array) -> Array:
-            width = jnp.where(jnp.isfinite(b - a), b - a, 1.0)
+            width = jnp.where(jnp.isfinite(b - a) & (b > a), b - a, 1.0)
             turned = jnp.mod(z - a, 2.0 * width)
             both = a + jnp.where(turned > width, 2.0 * width - turned, turned)
             one = jnp.where(jnp.isfinite(a), a + jnp.abs(z - a), b - jnp.abs(b - z))
@@ -145,4 +167,5 @@ class Reflection(_WithoutBarrier):
             folded = jnp.where(jnp.isfinite(b - a), both, jnp.where(free, z, one))
             return jnp.clip(folded, a, b)  # rounding only
 
-        return jax.tree.map(fold, new, *box.sides(new))
+        held = _with_slack_confined(box, old, new)
+        return jax.tree.map(fold, held, *box.sides(new))

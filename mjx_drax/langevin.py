@@ -201,13 +201,13 @@ class Langevin:
                 change = jax.tree.map(
                     lambda d, n: self.step_size * d + scale * n, to.drift, to.noise
                 )
-                new = self._moved(problem, old, change)
                 if not self.adjusted:
-                    return new
+                    return self._moved(problem, old, change)
+                new = jax.tree.map(jnp.add, old, change)
                 back = direction(new, multipliers, key, ()).drift
                 ratio = self._log_acceptance(problem, old, new, multipliers, to.drift, back, levels)
                 u = jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, iteration), 1))
-                inside = problem.bounds.violation(jax.tree.map(jnp.add, old, change)) == 0.0
+                inside = problem.bounds.violation(new) == 0.0
                 accepted = (jnp.log(u) < ratio) & inside
                 return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
 

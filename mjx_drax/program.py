@@ -80,6 +80,7 @@ class Minimum:
         inequality: multipliers of g, (chains, mg).
         cost: c(x), (chains,).
         max_defect: largest |h| or positive g, (chains,).
+        died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
     """
 
     x: np.ndarray
@@ -87,11 +88,12 @@ class Minimum:
     inequality: np.ndarray
     cost: np.ndarray
     max_defect: np.ndarray
+    died_at: np.ndarray
 
     @cached_property
     def best_chain(self) -> int:
         """The cheapest feasible chain, else the least infeasible one."""
-        feasible = self.max_defect < FEASIBLE
+        feasible = (self.max_defect < FEASIBLE) & (self.died_at < 0)
         if feasible.any():
             return int(np.argmin(np.where(feasible, self.cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
@@ -119,7 +121,14 @@ def minimize(
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
     knots = None
     if guess is not None:
-        u = jnp.asarray(guess)[..., None, :]
+        size = program.dynamics.nu
+        given = np.asarray(guess, float)
+        if given.shape not in ((size,), (chains, size)):
+            raise DraxError(
+                f"guess has shape {given.shape}: give ({size},), or ({chains}, {size}) with one "
+                "for each chain."
+            )
+        u = jnp.asarray(given)[..., None, :]
         knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
     result = run(program, chains, seed, solver or Langevin(), knots, progress)
     info, rows = result.records[-1][1], program.constraint.equalities
@@ -130,4 +139,5 @@ def minimize(
         inequality=multipliers[:, rows:],
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
+        died_at=np.asarray(result.state.died_at),
     )

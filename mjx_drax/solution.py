@@ -229,6 +229,8 @@ def solve(
         DraxError: sizes that misfit, or a cost or dynamics that are not finite at any initial knot.
     """
     problem = checked(problem)
+    if problem.dynamics.nx == 0:
+        raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     solver = solver or Langevin()
     return _certified(problem, solver, seed, run(problem, chains, seed, solver, guess, progress))
 

@@ -291,7 +291,6 @@ def test_numbers_of_constraints_change_without_recompiling():
     assert not np.array_equal(ends[0], ends[2])
 
 
-@pytest.mark.xfail(reason="without a barrier Gauss-Newton eliminates the row with its slack")
 @pytest.mark.parametrize("bounds", [Projection()])
 def test_gauss_newton_keeps_inequalities_whatever_the_bounds(bounds):
     # min 1/2 (x - 2)^2 s.t. x <= 1

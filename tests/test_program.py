@@ -224,7 +224,6 @@ def test_minimize_names_what_it_cannot_take(linear):
         minimize(from_program(1, cost=lambda x: jnp.log(-1.0 - x[0] ** 2)), chains=2)
 
 
-@pytest.mark.xfail(reason="IndexError from jax instead", raises=IndexError)
 def test_a_guess_that_is_a_number_is_named(linear):
     with pytest.raises(DraxError, match="guess"):
         minimize(linear, chains=2, guess=0.0)
