@@ -213,7 +213,7 @@ def test_misfits_are_named(arguments, message):
 
 
 def test_minimize_names_what_it_cannot_take(linear):
-    with pytest.raises(DraxError, match=r"guess\.u.*2.*3"):
+    with pytest.raises(DraxError, match=r"guess has shape.*2.*3"):
         minimize(linear, chains=2, guess=np.ones(2))
     trajectory = from_function(
         lambda x, u: x + u, x_init=[0.0], nu=1, dt=1.0, horizon=1.0, terminal_cost=lambda x: x @ x
