@@ -97,21 +97,21 @@ def render(
     return _write_video(path, frames, fps, size)
 
 
-def verdict(solution: Solution) -> str:
-    """What the replay that is shown came to, in one line."""
-    has_model = hasattr(solution.problem.dynamics, "mj_model")
-    engine = "MuJoCo C replay" if has_model else "float64 rollout"
-    return f"{engine}, {solution.replay_mode}: {solution.outcome(solution.replay_mode)}"
-
-
 def _overlay(solution: Solution) -> list[str]:
-    """Lines of text for a film."""
-    chain = solution.best_chain
-    defect = float(solution.max_defect[chain])
-    numbers = f"cost {float(solution.cost[chain]):.3g}   max|h| {defect:.1g}"
-    violation = float(solution.max_violation[chain])
-    numbers += f"   bound violation {violation:.1g}"
-    lines = [solution.problem.name, numbers, verdict(solution), "t = {time}"]
+    """Lines of text for a film, short ones, which leave the robot in view."""
+    chain, mode = solution.best_chain, solution.replay_mode
+    cost, defect, violation = (
+        float(a[chain]) for a in (solution.cost, solution.max_defect, solution.max_violation)
+    )
+    has_model = hasattr(solution.problem.dynamics, "mj_model")
+    lines = [
+        solution.problem.name,
+        f"cost {cost:.3g}   max|h| {defect:.1g}",
+        f"bound violation {violation:.1g}",
+        f"{'MuJoCo C replay' if has_model else 'float64 rollout'}, {mode}:",
+        solution.outcome(mode),
+        "t = {time}",
+    ]
     if not solution.certified:
         breach = "the plan breaks the dynamics"
         reason = "no replay succeeds" if solution.feasible[chain] else breach
