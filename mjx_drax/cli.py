@@ -26,6 +26,8 @@ A cost file is Python. It defines at least one of
   running_residual(data, u), terminal_residual(data)   vectors: adds half the squared norm
 on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
   goal(data) -> bool       what a replay in MuJoCo must reach
+  equality(data, u), terminal_equality(data)       vectors held at 0
+  inequality(data, u), terminal_inequality(data)   vectors held <= 0
   horizon, dt              [s]
   x_init                   [qpos, qvel, act]
   x_bounds, u_bounds       (lower, upper)
@@ -38,6 +40,10 @@ _PROBLEM_NAMES = (
     "terminal_cost",
     "running_residual",
     "terminal_residual",
+    "equality",
+    "inequality",
+    "terminal_equality",
+    "terminal_inequality",
     "goal",
     "horizon",
     "dt",
@@ -149,8 +155,8 @@ def _solve(options: argparse.Namespace) -> int:
     from mjx_drax.solution import solve
 
     if options.iterations is not None:
-        tail = max(1, round(options.iterations / solver.iterations * solver.tail))
-        solver = replace(solver, iterations=options.iterations, tail=tail)
+        share = options.iterations / max(solver.iterations, 1)
+        solver = replace(solver, iterations=options.iterations, tail=round(share * solver.tail))
     folder = results.writable(options.out or Path("out") / problem.name)
     _cache_compilations()
 
@@ -250,7 +256,7 @@ def _load_cost_file(path: Path) -> Any:
     sys.path.insert(0, str(path.resolve().parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise DraxError(
             f"the cost file {str(path)!r} failed: {type(error).__name__}: {error}"
         ) from error

@@ -242,6 +242,8 @@ class Langevin:
             trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
         else:
             trajectory, size = diffuse(state)
+        if self.preconditioner.multipliers_step_alone:
+            size = jnp.ones_like(size)
         multipliers = jax.tree.map(
             lambda m, rate: m + _per_chain(size, m) * rate,
             state.multipliers,

@@ -240,7 +240,7 @@ def from_mjcf(
 
     Costs see `mjx.Data` after `mjx.forward` (qpos, qvel, site and body positions, sensors, ...);
     what they do not read is not computed. Joint ranges and control ranges of the model become
-    bounds, to which `x_bounds` and `u_bounds` are added.
+    bounds, which are intersected with `x_bounds` and `u_bounds`.
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
@@ -313,8 +313,8 @@ def _substeps(model: mujoco.MjModel, dt: float | None) -> int:
     timestep = model.opt.timestep
     if dt is None:
         return max(1, round(0.02 / timestep))
-    if not (np.isfinite(dt) and dt > 0):
-        raise DraxError(f"dt is {dt}: give a positive number of seconds.")
+    if not (isinstance(dt, float | int | np.number) and np.isfinite(dt) and dt > 0):
+        raise DraxError(f"dt is {dt!r}: give a positive number of seconds.")
     substeps = round(dt / timestep)
     if substeps < 1 or abs(substeps * timestep - dt) > 1e-6 * dt:
         raise DraxError(
@@ -343,7 +343,7 @@ def _bounds(
     x_bounds: tuple[ArrayLike, ArrayLike] | None,
     u_bounds: tuple[ArrayLike, ArrayLike] | None,
 ) -> Any:
-    """The ranges of the model's joints, activations and controls, intersected with the user's."""
+    """The ranges of the model's joints and controls, intersected with the user's."""
     x_lower, x_upper = np.full(dynamics.nx, -np.inf), np.full(dynamics.nx, np.inf)
     limited = model.jnt_limited.astype(bool)
     where = model.jnt_qposadr[limited]
@@ -420,6 +420,12 @@ def _refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
         )
 
 
+def _excluded(model: mujoco.MjModel, a: int, b: int) -> bool:
+    """Whether the bodies of two geoms are excluded from contact."""
+    low, high = sorted((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
+    return bool(np.any(model.exclude_signature == (low << 16) + high))
+
+
 def _contact_pair(model: mujoco.MjModel) -> tuple[str, str] | None:
     """Names of the first two geoms between which MuJoCo may make a contact, or None."""
 
@@ -438,7 +444,7 @@ def _contact_pair(model: mujoco.MjModel) -> tuple[str, str] | None:
                 model.geom_contype[b] & model.geom_conaffinity[a]
             )
             wa, wb = weld[model.geom_bodyid[a]], weld[model.geom_bodyid[b]]
-            if not masks or wa == wb:
+            if not masks or wa == wb or _excluded(model, a, b):
                 continue
             pa, pb = (weld[model.body_parentid[w]] for w in (wa, wb))
             if parents and wa and wb and (wa == pb or wb == pa):

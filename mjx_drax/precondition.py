@@ -70,7 +70,9 @@ class Direction:
 
 
 class Memoryless:
-    """A metric that is made anew in every iteration."""
+    """A metric that is made anew in every iteration, and whose multipliers step with its knots."""
+
+    multipliers_step_alone = False
 
     def memory(self, problem: Problem, trajectory: Trajectory) -> tuple[()]:
         """Nothing."""

@@ -316,13 +316,13 @@ class Problem:
                 f"goal failed at x = {x.tolist()}: {type(error).__name__}: {error}. It gets the "
                 "state of a function problem, or the mujoco.MjData of a model."
             ) from error
-        if reached.size != 1:
-            raise DraxError(f"goal returned shape {reached.shape}: it must return one truth value.")
+        if reached.size != 1 or reached.dtype.kind not in "biuf":
+            raise DraxError(f"goal returned {reached!r}: it must return one truth value.")
         return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:
         """The same problem from another initial state (nx,)."""
-        return checked(replace(self, x_init=jnp.asarray(x_init, self.x_init.dtype)))
+        return checked(replace(self, x_init=vector("x_init", x_init)))
 
 
 def knots(horizon: float, dt: float) -> int:
@@ -332,14 +332,23 @@ def knots(horizon: float, dt: float) -> int:
         DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
     """
     for label, value in (("dt", dt), ("horizon", horizon)):
-        if not (np.isfinite(value) and value > 0):
-            raise DraxError(f"{label} is {value}: give a positive number of seconds.")
+        if not (isinstance(value, float | int | np.number) and np.isfinite(value) and value > 0):
+            raise DraxError(f"{label} is {value!r}: give a positive number of seconds.")
     count = round(horizon / dt)
     if count < 1:
         raise DraxError(
             f"horizon is {horizon} s, shorter than one control step: give at least {dt:g} s."
         )
     return count
+
+
+def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:
+    """(lower, upper) as given, or infinite for None."""
+    if ends is None:
+        return -np.inf, np.inf
+    if not isinstance(ends, tuple | list | np.ndarray) or len(ends) != 2:
+        raise DraxError(f"bounds of {label} are {ends!r}: give a pair (lower, upper).")
+    return ends[0], ends[1]
 
 
 def box(
@@ -357,13 +366,12 @@ def box(
         try:
             array = np.asarray(value, float)
             return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise DraxError(
                 f"{label} is {value!r}: give numbers of shape ({size},), or one for all."
             ) from error
 
-    free = (-jnp.inf, jnp.inf)
-    (xl, xu), (ul, uu) = x or free, u or free
+    (xl, xu), (ul, uu) = _pair("x", x), _pair("u", u)
     return Box(
         end(xl, nx, "lower end of x"),
         end(xu, nx, "upper end of x"),
@@ -511,17 +519,25 @@ def scatter_box(
     nx, nu = x_init.shape[0], bounds.u_lower.shape[-1]
     given = box(nx, nu, x, u)
 
-    def pick(asked: Array, bound: Array, otherwise: Array) -> Array:
-        return jnp.where(
-            jnp.isfinite(asked), asked, jnp.where(jnp.isfinite(bound), bound, otherwise)
+    def ends(
+        asked: tuple[Array, Array], bound: tuple[Array, Array], middle: Array, reach: Array
+    ) -> tuple[Array, Array]:
+        low, high = (jnp.where(jnp.isfinite(a), a, b) for a, b in zip(asked, bound, strict=True))
+        # Where an end is free: next to the other one, or about the middle if both are.
+        middle = jnp.clip(middle, low + reach, high - reach)
+        return (
+            jnp.where(jnp.isfinite(low), low, middle - reach),
+            jnp.where(jnp.isfinite(high), high, middle + reach),
         )
 
-    return Box(
-        pick(given.x_lower, bounds.x_lower, x_init - reach),
-        pick(given.x_upper, bounds.x_upper, x_init + reach),
-        pick(given.u_lower, bounds.u_lower, -jnp.ones(nu)),
-        pick(given.u_upper, bounds.u_upper, jnp.ones(nu)),
+    x_ends = ends((given.x_lower, given.x_upper), (bounds.x_lower, bounds.x_upper), x_init, reach)
+    u_ends = ends(
+        (given.u_lower, given.u_upper),
+        (bounds.u_lower, bounds.u_upper),
+        jnp.zeros(nu),
+        jnp.ones(nu),
     )
+    return Box(x_ends[0], x_ends[1], u_ends[0], u_ends[1])
 
 
 def checked(problem: Problem) -> Problem:

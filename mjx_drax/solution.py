@@ -255,8 +255,10 @@ def run(
     progress: Progress | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments."""
-    if chains < 1:
-        raise DraxError(f"chains is {chains}: give at least 1.")
+    if not isinstance(chains, int | np.integer) or chains < 1:
+        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+        raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
     total = int(solver.iterations) + int(solver.tail)
     if total < 1:
         raise DraxError(f"iterations + tail is {total}: give at least 1.")
@@ -341,7 +343,7 @@ def _certified(problem: Problem, solver: Langevin, seed: int, run: Run) -> Solut
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
         max_violation=np.asarray(info.max_violation),
-        converged_at=run.converged_at,
+        converged_at=np.where(np.asarray(state.died_at) < 0, run.converged_at, -1),
         died_at=np.asarray(state.died_at),
         open_loop=_replays(problem, trajectories, np.zeros_like(gains)),
         feedback=_replays(problem, trajectories, gains),

@@ -1,0 +1,76 @@
+"""Problems from functions: what is refused, and where initial knots are scattered."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax import (
+    LBFGS,
+    Constant,
+    DraxError,
+    Langevin,
+    from_function,
+    from_program,
+    minimize,
+    solve,
+)
+
+
+def make(**changes):
+    given = {"x_init": [0.0], "nu": 1, "dt": 0.1, "horizon": 1.0, "terminal_cost": lambda x: x @ x}
+    return from_function(lambda x, u: x + u, **{**given, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x_bounds": 3.0}, "bounds of x are 3.0"),
+        ({"u_bounds": (1, 2, 3)}, r"pair \(lower, upper\)"),
+        ({"u_bounds": ({}, 1)}, "lower end of u"),
+        ({"u_bounds": (1.0, -1.0)}, "cross"),
+        ({"horizon": "2"}, "horizon is '2'"),
+        ({"horizon": -1.0}, "horizon is -1.0"),
+        ({"goal": lambda x: "no"}, "one truth value"),
+        ({"x_init": [np.nan]}, "finite"),
+    ],
+)
+def test_misfits_are_named(changes, message):
+    with pytest.raises(DraxError, match=message):
+        make(**changes)
+
+
+@pytest.mark.parametrize("arguments", [{"chains": 0}, {"chains": 2.5}, {"seed": -1}, {"seed": 1.5}])
+def test_solve_wants_whole_numbers(arguments):
+    with pytest.raises(DraxError, match=next(iter(arguments))):
+        solve(make(), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "scatter"),
+    [
+        ((5.0, np.inf), (5.0, 7.0)),
+        ((-np.inf, -3.0), (-5.0, -3.0)),
+        ((-np.inf, np.inf), (-1.0, 1.0)),
+        ((-0.5, 4.0), (-0.5, 4.0)),
+    ],
+)
+def test_knots_are_scattered_inside_one_sided_bounds(bounds, scatter):
+    box = make(u_bounds=bounds).scatter
+    assert (float(box.u_lower[0]), float(box.u_upper[0])) == scatter
+
+
+def test_lbfgs_is_a_method_of_multipliers():
+    # min (a - 1)^2 + 10 (b - a^2)^2  s.t.  a + b = 1: eliminate b and set the derivative to zero.
+    slope = np.polyder(np.polyadd([1, -2, 1], 10 * np.polymul([-1, -1, 1], [-1, -1, 1])))
+    stationary = [float(a.real) for a in np.roots(slope) if abs(a.imag) < 1e-9]
+    program = from_program(
+        2,
+        cost=lambda x: (x[0] - 1) ** 2 + 10 * (x[1] - x[0] ** 2) ** 2,
+        equality=lambda x: jnp.array([x.sum() - 1.0]),
+    )
+    solver = Langevin(
+        iterations=0, tail=400, penalty=Constant(10.0), preconditioner=LBFGS(inner=20)
+    )
+    found = minimize(program, chains=16, solver=solver)
+    assert np.median(found.max_defect) < 1e-4
+    assert min(abs(found.best[0] - a) for a in stationary) < 1e-2
