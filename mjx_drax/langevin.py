@@ -3,7 +3,7 @@
 One iteration of a chain (Kurtz and Burdick, with the metric M of `precondition`):
 
     X      <- X + alpha d + sigma sqrt(2 alpha) n,    d = -M^{-1} grad L_mu,  n ~ N(0, M^{-1})
-    lambda <- lambda + alpha r,                       r = mu (h + J d)
+    lambda <- lambda + alpha r,                       r = mu (h + J d)  (Identity: 2 mu h)
 
 While sigma > 0 knots leave the dynamics and wander between basins; the multipliers pull them back
 onto h = 0 as sigma falls. The noise-free tail then takes the step size that lowers the augmented
@@ -93,7 +93,7 @@ class Info:
 @register_dataclass
 @dataclass(frozen=True)
 class Langevin:
-    """The solver: its settings and its interchangeable parts. Every number is traced.
+    """The solver: its settings, which are traced, and its interchangeable parts.
 
     Attributes:
         iterations: iterations with noise.
