@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
@@ -120,6 +121,33 @@ class Langevin:
     bounds: Bounds = field(default_factory=LogBarrier)
     adjusted: bool = field(default=False, metadata=Static)
 
+    def check(self, problem: Problem) -> None:
+        """Complain about settings that cannot work.
+
+        Raises:
+            DraxError: naming the setting, its value and the fix.
+        """
+        for name in ("iterations", "tail"):
+            count = getattr(self, name)
+            if not isinstance(count, int | np.integer) or count < 0:
+                raise DraxError(f"{name} is {count!r}: give a whole number of at least 0.")
+        if self.iterations + self.tail < 1:
+            raise DraxError("iterations + tail is 0: give at least 1.")
+        for name in ("noise", "penalty", "damping", "barrier_weight"):
+            schedule = getattr(self, name)
+            if not callable(schedule):
+                raise DraxError(f"{name} is {schedule!r}: give a schedule, Constant({schedule!r}).")
+        for name in ("preconditioner", "bounds"):
+            part = getattr(self, name)
+            if isinstance(part, type):
+                raise DraxError(f"{name} is a class: give an object, {part.__name__}().")
+        constrained = problem.constraint.inequalities + problem.terminal_constraint.inequalities
+        if self.adjusted and (constrained or not isinstance(self.preconditioner, Identity)):
+            raise DraxError(
+                f"adjusted=True with {type(self.preconditioner).__name__} and {constrained} "
+                "inequalities: Metropolis adjustment needs Identity() and no inequalities."
+            )
+
     def levels(self, t: ArrayLike) -> Levels:
         """The schedules' values at progress t in [0, 2]."""
         t = jnp.asarray(t)
@@ -134,11 +162,7 @@ class Langevin:
             key: one random key; chain c uses fold_in(key, c), so that results do not depend on how
                 chains are split over calls or devices.
         """
-        if self.adjusted and not isinstance(self.preconditioner, Identity):
-            raise DraxError(
-                f"adjusted=True with {type(self.preconditioner).__name__}: Metropolis adjustment "
-                "needs a metric that does not change along the way; use Identity()."
-            )
+        self.check(problem)
         chains, dynamics = trajectory.x.shape[0], problem.dynamics
         K, nu, ndx = problem.horizon, dynamics.nu, dynamics.ndx
         with_slack = jax.vmap(_with_slack, in_axes=(None, 0))(problem, trajectory)

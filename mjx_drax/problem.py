@@ -317,7 +317,9 @@ class Problem:
                 "state of a function problem, or the mujoco.MjData of a model."
             ) from error
         if reached.size != 1 or reached.dtype.kind not in "biuf":
-            raise DraxError(f"goal returned {reached!r}: it must return one truth value.")
+            raise DraxError(
+                f"goal returned shape {reached.shape}, {reached!r}: it must return one truth value."
+            )
         return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:

@@ -259,9 +259,8 @@ def run(
         raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
     if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
         raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
-    total = int(solver.iterations) + int(solver.tail)
-    if total < 1:
-        raise DraxError(f"iterations + tail is {total}: give at least 1.")
+    solver.check(problem)
+    total = solver.iterations + solver.tail
     key_knots, key_noise = jax.random.split(jax.random.key(seed))
     state = solver.init(problem, _initial_knots(problem, chains, guess, key_knots), key_noise)
 

@@ -46,6 +46,20 @@ def test_solve_wants_whole_numbers(arguments):
 
 
 @pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"noise": 0.1}, r"Constant\(0.1\)"),
+        ({"preconditioner": LBFGS}, r"LBFGS\(\)"),
+        ({"tail": -1}, "tail is -1"),
+        ({"iterations": 0, "tail": 0}, "at least 1"),
+    ],
+)
+def test_settings_that_cannot_work_are_named(settings, message):
+    with pytest.raises(DraxError, match=message):
+        solve(make(), solver=Langevin(**settings))
+
+
+@pytest.mark.parametrize(
     ("bounds", "scatter"),
     [
         ((5.0, np.inf), (5.0, 7.0)),
