@@ -141,6 +141,9 @@ class Langevin:
             part = getattr(self, name)
             if isinstance(part, type):
                 raise DraxError(f"{name} is a class: give an object, {part.__name__}().")
+        self._check_adjusted(problem)
+
+    def _check_adjusted(self, problem: Problem) -> None:
         constrained = problem.constraint.inequalities + problem.terminal_constraint.inequalities
         if self.adjusted and (constrained or not isinstance(self.preconditioner, Identity)):
             raise DraxError(
@@ -162,7 +165,7 @@ class Langevin:
             key: one random key; chain c uses fold_in(key, c), so that results do not depend on how
                 chains are split over calls or devices.
         """
-        self.check(problem)
+        self._check_adjusted(problem)
         chains, dynamics = trajectory.x.shape[0], problem.dynamics
         K, nu, ndx = problem.horizon, dynamics.nu, dynamics.ndx
         with_slack = jax.vmap(_with_slack, in_axes=(None, 0))(problem, trajectory)
