@@ -144,6 +144,7 @@ class Langevin:
         self._check_adjusted(problem)
 
     def _check_adjusted(self, problem: Problem) -> None:
+        """The part of `check` that `init` repeats, where counts may be traced."""
         constrained = problem.constraint.inequalities + problem.terminal_constraint.inequalities
         if self.adjusted and (constrained or not isinstance(self.preconditioner, Identity)):
             raise DraxError(
