@@ -62,7 +62,14 @@ def test_help_imports_nothing_heavy():
 def test_list_names_every_task(capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
-    for name in ("pendulum", "bug_trap", "pendulum_swingup", "cartpole_swingup", "acrobot_swingup"):
+    for name in (
+        "pendulum",
+        "bug_trap",
+        "deep_trap",
+        "pendulum_swingup",
+        "cartpole_swingup",
+        "acrobot_swingup",
+    ):
         assert name in out
         assert name in tasks.names()
 
