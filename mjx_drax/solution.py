@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,9 @@ from mjx_drax.langevin import (
 )
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
+
+if TYPE_CHECKING:
+    from mjx_drax.optima import Optimum
 
 TRACKED = 1e-2
 """Largest final deviation |x - plan| of a successful replay, where the problem has no goal."""
@@ -173,6 +176,13 @@ class Solution:
             self.open_loop.summary(self.best_chain),
             self.feedback.summary(self.best_chain),
         )
+
+    @cached_property
+    def optima(self) -> tuple[Optimum, ...]:
+        """The distinct local optima among the certified chains, best first; see `optima`."""
+        from mjx_drax.optima import distinct
+
+        return distinct(self)
 
     @property
     def certified(self) -> bool:
