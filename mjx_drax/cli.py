@@ -55,6 +55,9 @@ _PROBLEM_NAMES = (
     "guess",
 )
 
+OPTIMA = 5
+"""So many distinct optima are printed."""
+
 REPRODUCIBLE = ("phase-portrait", "convergence", "bug-trap", "parallel-table", "open-questions")
 
 
@@ -165,10 +168,13 @@ def _solve(options: argparse.Namespace) -> int:
     with _Bar() as bar:
         solution = solve(problem, chains, options.seed, solver, progress=bar)
     results.save(solution, folder)
-    from mjx_drax.plotting import plot_solution
+    from mjx_drax.plotting import plot_optima, plot_solution
 
     plot_solution(solution, folder / "plot.png", draw=draw)
     written = ["result.json", "result.npz", "plot.png"]
+    if len(solution.optima) > 1:
+        plot_optima(solution, folder / "optima.png", draw=draw)
+        written.append("optima.png")
     if not options.no_video and (draw is not None or hasattr(problem.dynamics, "mj_model")):
         from mjx_drax.rendering import render
 
@@ -318,9 +324,31 @@ def _report(solution: Solution) -> None:
     )
     for mode in (OPEN_LOOP, WITH_FEEDBACK):
         say(f"{mode:14} {solution.outcome(mode)}")
+    for line in _optima(solution):
+        say(line)
     say(f"engine         {solution.certificate.engine}")
     say(f"time           compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s")
     say("CERTIFIED" if solution.certified else "NOT CERTIFIED: " + _advice(solution))
+
+
+def _optima(solution: Solution) -> list[str]:
+    """The cheapest of the distinct optima as a table, by lines; none if no chain is certified."""
+    found = solution.optima
+    if len(found) < 2:
+        return ["optima         one: certified chains agree on the motion"] if found else []
+    words = ("misses goal", "reaches goal")
+    if solution.problem.goal is None:
+        words = ("leaves plan", "keeps to plan")
+    lines = [f"optima         rank {'cost':>9}  chains  {'open loop':13}  with feedback"]
+    for rank, optimum in enumerate(found[:OPTIMA], 1):
+        replays = optimum.certificate.open_loop, optimum.certificate.feedback
+        open_loop, feedback = (words[replay["success"]] for replay in replays)
+        lines.append(
+            f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback}"
+        )
+    if len(found) > OPTIMA:
+        lines.append(f"{'':14} and {len(found) - OPTIMA} more")
+    return lines
 
 
 def _advice(solution: Solution) -> str:

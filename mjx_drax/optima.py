@@ -36,6 +36,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import ArrayLike
 
 from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
@@ -46,8 +47,9 @@ if TYPE_CHECKING:
     from mjx_drax.solution import Certificate, Solution
 
 TOLERANCE = 0.25
-"""Motions are the same way if they differ, in the root mean square, by less than a quarter of the
-states' standard deviation."""
+"""Motions are the same if they differ, in the root mean square, by less than a quarter of the
+states' standard deviation. In `bug_trap` and `deep_trap`, run until they converged, the 16 and 14
+optima are 0.37 apart or more, and chains of one optimum 2e-5 or less."""
 
 LANDMARKS = 512
 """So many are kept, for bounded time; beyond that, chains near none are in no optimum."""
@@ -83,8 +85,8 @@ def distinct(solution: Solution, tolerance: float = TOLERANCE) -> tuple[Optimum,
 
     Args:
         solution: from `solve`.
-        tolerance: distance d within which motions are the same way, in standard deviations of the
-            states; smaller tells more ways apart.
+        tolerance: distance d within which motions are the same, in standard deviations of the
+            states; a smaller one tells more of them apart.
 
     Raises:
         DraxError: the tolerance is not a positive number.
@@ -101,7 +103,7 @@ def distinct(solution: Solution, tolerance: float = TOLERANCE) -> tuple[Optimum,
     return tuple(_optimum(solution, order[group == g]) for g in range(group.max() + 1))
 
 
-def cluster(dynamics: Dynamics, states: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+def cluster(dynamics: Dynamics, states: ArrayLike, tolerance: float = TOLERANCE) -> np.ndarray:
     """Which optimum each motion belongs to, (n,): 0, 1, ... in order of appearance, -1 for none.
 
     Args:
@@ -111,7 +113,7 @@ def cluster(dynamics: Dynamics, states: np.ndarray, tolerance: float = TOLERANCE
     """
     motions = jnp.asarray(states)
     scale = _spread(dynamics, motions)
-    nearest, group = np.full(len(states), np.inf), np.full(len(states), -1)
+    nearest, group = np.full(len(motions), np.inf), np.full(len(motions), -1)
     found = 0
     for _ in range(LANDMARKS):
         far = np.flatnonzero(nearest > tolerance / 2)

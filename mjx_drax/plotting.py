@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mjx_drax.dynamics import Dynamics
+    from mjx_drax.optima import Optimum
 
     Draw = Callable[[Axes, np.ndarray], None]
 
@@ -35,8 +36,12 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GRAY = "#0072B2", "#D55E00", "#CC79A7", "#767676"
 CURVES = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY)
 
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
+
 DPI = 150
 COLUMNS = 2
+MAPS, PANELS = 9, 12
+"""Most panels of `plot_optima`: optima on maps, coordinates of states."""
 
 
 def plot_solution(
@@ -74,6 +79,60 @@ def plot_solution(
         panel(figure.add_subplot(grid[row, column:last]))
     color = BLACK if solution.certified else VERMILLION
     figure.suptitle(_title(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
+    return _save(figure, path)
+
+
+def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | None = None) -> Path:
+    """Draws the cheapest of a solution's distinct optima as a PNG, and returns its path.
+
+    Each is drawn as replayed. With `draw`: side by side, up to `MAPS` of them, one panel each.
+    Without: over each other, as many as there are colors, one panel for each of the first
+    `PANELS` coordinates of the state.
+
+    Args:
+        solution: from `solve`.
+        path: where to, ending in .png; its folder is made if need be.
+        draw: draw(axes, states (K + 1, nx)); tasks may have one.
+
+    Raises:
+        DraxError: no chain is certified, or the path cannot be written.
+    """
+    found = solution.optima
+    if not found:
+        raise DraxError(
+            f"{solution.problem.name} has no optima to draw: no chain is certified. See "
+            "solution.certificate."
+        )
+    panels: list[Callable[[Axes], None]]
+    if draw is not None:
+        shown = found[:MAPS]
+        panels = [
+            partial(_draw_map, rank=rank, optimum=optimum, draw=draw)
+            for rank, optimum in enumerate(shown, 1)
+        ]
+        columns, size = min(3, len(panels)), (3.0, 3.2)
+    else:
+        shown = found[: len(CURVES)]
+        labels = [n for _, names in _state_labels(solution.problem.dynamics) for n in names]
+        panels = [
+            partial(_draw_ways, optima=shown, column=i, label=label, times=solution.problem.times)
+            for i, label in enumerate(labels[:PANELS])
+        ]
+        columns, size = min(COLUMNS, len(panels)), (4.0, 2.6)
+    rows = -(-len(panels) // columns)
+    inches = (max(size[0] * columns, 5.0), size[1] * rows + 0.8)
+    figure = Figure(inches, DPI, layout="constrained", facecolor="white")
+    for i, panel in enumerate(panels, 1):
+        panel(figure.add_subplot(rows, columns, i))
+    if draw is None:
+        names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+    drawn = "" if len(shown) == len(found) else f", the cheapest {len(shown)}"
+    figure.suptitle(
+        f"{solution.problem.name}: {len(found)} distinct optima{drawn}, as replayed",
+        fontsize=9,
+        parse_math=False,
+    )
     return _save(figure, path)
 
 
@@ -116,6 +175,39 @@ def _draw_scene(axes: Axes, solution: Solution, draw: Draw) -> None:
     axes.tick_params(labelsize=8)
     for axis in (axes.xaxis, axes.yaxis):
         axis.label.set_fontsize(8)
+
+
+# Distinct optima
+
+
+def _name(rank: int, optimum: Optimum) -> str:
+    return f"{rank}: cost {optimum.cost:.4g}, {optimum.share:.0%} of chains"
+
+
+def _draw_map(axes: Axes, rank: int, optimum: Optimum, draw: Draw) -> None:
+    """One optimum among its surroundings, as the task draws it."""
+    draw(axes, optimum.replayed[0])
+    axes.set_title(_name(rank, optimum), loc="left", fontsize=8, fontweight="bold")
+    axes.set(xlabel="", ylabel="")
+    axes.tick_params(labelsize=7)
+
+
+def _draw_ways(
+    axes: Axes, optima: Sequence[Optimum], column: int, label: str, times: np.ndarray
+) -> None:
+    """One coordinate of the state over time, a curve for every optimum; the cheapest on top."""
+    for i, optimum in enumerate(optima):
+        axes.plot(
+            times,
+            optimum.replayed[0][:, column],
+            color=CURVES[i],
+            linestyle=DASHES[i],
+            lw=1.8,
+            zorder=3 - i / len(optima),
+            label=_name(i + 1, optimum),
+        )
+    axes.set_xlim(times[0], times[-1])
+    _label(axes, label, "time [s]", [])
 
 
 @dataclass(frozen=True)
@@ -325,6 +417,8 @@ def _label(
     axes.grid(True, color="0.9", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+    if not handles:
+        return
     legend = axes.legend(
         handles=list(handles), fontsize=7, framealpha=0.8, edgecolor="none", **legend_style
     )

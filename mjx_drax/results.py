@@ -14,7 +14,12 @@ import numpy as np
 
 from mjx_drax import __version__
 from mjx_drax.errors import DraxError
+from mjx_drax.optima import Optimum
+from mjx_drax.problem import Trajectory
 from mjx_drax.solution import Solution
+
+OPTIMA = 32
+"""So many of the distinct optima, cheapest first, go into result files."""
 
 
 def summary(solution: Solution) -> dict[str, Any]:
@@ -42,6 +47,8 @@ def summary(solution: Solution) -> dict[str, Any]:
             "open_loop": _finite(certificate.open_loop),
             "feedback": _finite(certificate.feedback),
         },
+        "optima_found": len(solution.optima),
+        "optima": [_answer(optimum) for optimum in solution.optima[:OPTIMA]],
         "versions": {
             "python": sys.version.split()[0],
             "mjx-drax": __version__,
@@ -56,9 +63,16 @@ def arrays(solution: Solution) -> dict[str, np.ndarray]:
 
     times (K+1,); states (K+1, nx), controls (K, nu), multipliers (K, ndx) and gains (K, nu, ndx) of
     the best chain's plan; replayed_states and replayed_controls; chain_* (chains,); history_*
-    (records,) or (records, chains).
+    (records,) or (records, chains). Plans of the distinct optima in the order of `result.json`:
+    optima_states (optima, K+1, nx), optima_controls (optima, K, nu); chain_optimum is the place in
+    the order of all optima found, -1 for chains in none.
     """
     best = solution.best_chain
+    ways = np.array([optimum.chain for optimum in solution.optima[:OPTIMA]], int)
+    plans = Trajectory(solution.trajectories.x[ways], solution.trajectories.u[ways])
+    optimum_of = np.full(solution.chains, -1)
+    for place, optimum in enumerate(solution.optima):
+        optimum_of[optimum.members] = place
     replayed_states, replayed_controls = solution.replayed
     return {
         "times": solution.problem.times,
@@ -70,6 +84,9 @@ def arrays(solution: Solution) -> dict[str, np.ndarray]:
         "gains": solution.gains[best],
         "replayed_states": replayed_states,
         "replayed_controls": replayed_controls,
+        "optima_states": np.asarray(solution.problem.with_start(plans)),
+        "optima_controls": plans.u,
+        "chain_optimum": optimum_of,
         "chain_cost": solution.cost,
         "chain_max_defect": solution.max_defect,
         "chain_max_violation": solution.max_violation,
@@ -78,6 +95,19 @@ def arrays(solution: Solution) -> dict[str, np.ndarray]:
         "chain_converged_at": solution.converged_at,
         "chain_died_at": solution.died_at,
         **{f"history_{name}": values for name, values in solution.history.items()},
+    }
+
+
+def _answer(optimum: Optimum) -> dict[str, Any]:
+    """One of the optima in `result.json`; share is of all chains."""
+    return {
+        "chain": optimum.chain,
+        "cost": _number(optimum.cost),
+        "max_defect": _number(optimum.max_defect),
+        "members": len(optimum.members),
+        "share": optimum.share,
+        "open_loop": _finite(optimum.certificate.open_loop),
+        "feedback": _finite(optimum.certificate.feedback),
     }
 
 
