@@ -73,6 +73,12 @@ def test_a_slope_from_one_way_to_the_other_is_one_optimum():
     assert cluster(FLAT, detour([1.0, -1.0])).any()
 
 
+def test_a_chain_stays_with_a_cheaper_one_when_a_costlier_one_is_nearer():
+    places = np.array([0.0, 0.5, 1.2, 0.65])  # in tolerances; the last one belongs to the third
+    states = np.stack([places, places], axis=-1)[:, None]
+    np.testing.assert_array_equal(cluster(FLAT, states, 1 / places.std()), [0, 0, 1, 1])
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_few_chains(count):
     np.testing.assert_array_equal(cluster(FLAT, detour([1.0, -1.0][:count])), range(count))
