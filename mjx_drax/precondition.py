@@ -24,7 +24,7 @@ from mjx_drax.constraints import Eliminated, eliminate, recover
 from mjx_drax.derivatives import Autodiff, Differentiator
 from mjx_drax.linearize import Linearization, linearize
 from mjx_drax.problem import Problem, Stagewise, Trajectory
-from mjx_drax.riccati import QuadraticCost, factorize, solve_and_sample
+from mjx_drax.riccati import QuadraticCost, White, newton
 
 Bounds = LogBarrier | Projection | Reflection
 
@@ -356,28 +356,30 @@ class GaussNewton(Memoryless):
             cost.Hux + H[:, ndx:, :ndx],
             cost.Huu + H[:, ndx:, ndx:],
         )
-        factors = factorize(model.dynamics, cost, multipliers.dynamics, levels.penalty)
-        dx, du, nx, nu_, rate = solve_and_sample(
-            model.dynamics, factors, multipliers.dynamics, levels.penalty, key_noise
+        key_u, key_e = jax.random.split(key_noise)
+        white = White(
+            jax.random.normal(key_u, trajectory.u.shape),
+            jax.random.normal(key_e, multipliers.dynamics.shape),
         )
+        step = newton(model.dynamics, cost, multipliers.dynamics, levels.penalty, white)
 
         def back(block: Eliminated, dz: Array, nz: Array, xi: Array) -> Any:
             return recover(block, dz, nz, xi, levels.penalty)
 
-        white = (
+        slack_white = (
             jax.random.normal(key_slack, blocks.D.shape),
             jax.random.normal(jax.random.fold_in(key_slack, 1), block_end.D.shape),
         )
         ds, ns, rate_stage = jax.vmap(back)(
-            blocks, _stage_steps(dx, du), _stage_steps(nx, nu_), white[0]
+            blocks, _stage_steps(step.dx, step.du), _stage_steps(step.nx, step.nu), slack_white[0]
         )
-        ds_end, ns_end, rate_end = back(block_end, dx[-1], nx[-1], white[1])
+        ds_end, ns_end, rate_end = back(block_end, step.dx[-1], step.nx[-1], slack_white[1])
         has_slack = trajectory.slack is not None
         return Direction(
-            Trajectory(dx, du, Stagewise(ds, ds_end) if has_slack else None),
-            Trajectory(nx, nu_, Stagewise(ns, ns_end) if has_slack else None),
-            Multipliers(rate, Stagewise(rate_stage, rate_end)),
-            factors.K,
+            Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if has_slack else None),
+            Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if has_slack else None),
+            Multipliers(step.rate, Stagewise(rate_stage, rate_end)),
+            step.K,
         )
 
 

@@ -23,19 +23,27 @@ and S are at hand. Newton step and noise are hence two solutions of one affine r
     dx_{k+1} = F_k dx_k + f_k,     F = mu S^{-1} (A + B K)
 
 that is solved in parallel over time. Shapes: all arrays carry the stage axis K first.
+
+On a GPU a batch of chains with small blocks goes through one kernel instead (`riccati_kernel`): the
+recursion as a loop of array operations is bound by its launches there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_batching import custom_vmap
 from jax.tree_util import register_dataclass
 
 from mjx_drax.linalg import cholesky, solve, solve_upper, symmetric
 from mjx_drax.linearize import Linearization
+
+MAX_NDX, MAX_NU = 6, 4
+"""Largest blocks that the kernel unrolls; compiling it takes longer than it saves beyond."""
 
 
 @register_dataclass
@@ -70,6 +78,32 @@ class Factorization:
     p: Array
 
 
+@register_dataclass
+@dataclass(frozen=True)
+class White:
+    """Standard normal numbers that become noise: for controls (K, nu) and for defects (K, ndx)."""
+
+    u: Array
+    e: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Step:
+    """What a chain moves by.
+
+    Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise nx, nu alike; the multipliers' step
+    `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx).
+    """
+
+    dx: Array
+    du: Array
+    nx: Array
+    nu: Array
+    rate: Array
+    K: Array
+
+
 def factorize(
     model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array
 ) -> Factorization:
@@ -100,16 +134,12 @@ def factorize(
 
 
 def solve_and_sample(
-    model: Linearization, factors: Factorization, multipliers: Array, penalty: Array, key: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+    model: Linearization, factors: Factorization, multipliers: Array, penalty: Array, white: White
+) -> Step:
     """The Newton step d = -M^{-1} grad L_mu, one draw n ~ N(0, M^{-1}), and the multipliers' step.
 
-    Returns dx (K, ndx) at x_1..x_K, du (K, nu), nx (K, ndx), nu (K, nu) and mu (h + J d) (K, ndx),
-    which is the costate P dx + p of the quadratic program less the present multipliers.
+    The last is the costate P dx + p of the quadratic program less the present multipliers.
     """
-    key_u, key_s = jax.random.split(key)
-    white_u = jax.random.normal(key_u, factors.kff.shape, factors.kff.dtype)
-    white_s = jax.random.normal(key_s, factors.p.shape, factors.p.dtype)
 
     def affine(
         model: Linearization, factors: Factorization, multiplier: Array, xi_u: Array, xi_s: Array
@@ -126,7 +156,7 @@ def solve_and_sample(
         F, f, f_noise = out[:, :-2], out[:, -2], out[:, -1] - n_s
         return F, jnp.column_stack([f, f_noise])
 
-    F, f = jax.vmap(affine)(model, factors, multipliers, white_u, white_s)
+    F, f = jax.vmap(affine)(model, factors, multipliers, white.u, white.e)
 
     def compose(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
         return second[0] @ first[0], second[0] @ first[1] + second[1]
@@ -135,7 +165,59 @@ def solve_and_sample(
     before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])
     controls = factors.K @ before
     du = controls[..., 0] + factors.kff
-    nu = controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white_u)
+    nu = controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
     dx, nx = after[..., 0], after[..., 1]
     costate = jnp.einsum("kij,kj->ki", factors.P, dx) + factors.p
-    return dx, du, nx, nu, costate - multipliers
+    return Step(dx, du, nx, nu, costate - multipliers, factors.K)
+
+
+@custom_vmap
+def newton(
+    model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array, white: White
+) -> Step:
+    """Newton step and noise of one chain; a batch of chains by whatever suits the device."""
+    factors = factorize(model, cost, multipliers, penalty)
+    return solve_and_sample(model, factors, multipliers, penalty, white)
+
+
+@custom_vmap
+def _batch(*arguments: Any) -> Step:
+    """`newton` of many chains; every array leads with the chain axis."""
+    _, cost, multipliers, _, _ = arguments
+    plain = jax.vmap(newton.fun)
+    fits = multipliers.dtype == jnp.float32 and 0 < cost.gx.shape[-1] <= MAX_NDX
+    if not (fits and 0 < cost.gu.shape[-1] <= MAX_NU and jax.default_backend() == "gpu"):
+        return plain(*arguments)
+    from mjx_drax.riccati_kernel import newton_batch  # only here: importing Pallas takes a second
+
+    return jax.lax.platform_dependent(*arguments, cuda=newton_batch, default=plain)
+
+
+@newton.def_vmap
+def _over_chains(size: int, batched: Any, *arguments: Any) -> tuple[Step, Step]:
+    """vmap over chains is one call of `_batch`."""
+    return _all_batched(_batch(*_spread(size, batched, arguments)))
+
+
+@_batch.def_vmap
+def _over_problems(size: int, batched: Any, *arguments: Any) -> tuple[Step, Step]:
+    """vmap over problems just makes the batch longer."""
+    spread = _spread(size, batched, arguments)
+    chains = spread[2].shape[1]
+    merged = jax.tree.map(lambda a: a.reshape(size * chains, *a.shape[2:]), spread)
+    step = _batch(*merged)
+    return _all_batched(jax.tree.map(lambda a: a.reshape(size, chains, *a.shape[1:]), step))
+
+
+def _spread(size: int, batched: Any, arguments: Any) -> Any:
+    """The arguments, those that lack the mapped axis repeated along it."""
+    return jax.tree.map(
+        lambda a, b: a if b else jnp.broadcast_to(a, (size, *jnp.shape(a))),
+        arguments,
+        tuple(batched),
+    )
+
+
+def _all_batched(step: Step) -> tuple[Step, Step]:
+    """The result, and that all of it has the mapped axis."""
+    return step, jax.tree.map(lambda _: True, step)

@@ -7,7 +7,8 @@ import pytest
 from scipy.linalg import block_diag, solve_discrete_are
 
 from mjx_drax.linearize import Linearization
-from mjx_drax.riccati import QuadraticCost, factorize, solve_and_sample
+from mjx_drax.riccati import QuadraticCost, White, factorize, newton, solve_and_sample
+from mjx_drax.riccati_kernel import newton_batch
 
 K, NDX, NU = 6, 3, 2
 KEY = jax.random.key(0)
@@ -50,10 +51,11 @@ def flat(x, u):
     return np.concatenate([np.ravel(x), np.ravel(u)])
 
 
-@jax.jit
-def newton(model, cost, multipliers, mu, key):
-    factors = factorize(model, cost, multipliers, mu)
-    return solve_and_sample(model, factors, multipliers, mu, key)
+def white(key, dtype=None):
+    key_u, key_e = jax.random.split(key)
+    return White(
+        jax.random.normal(key_u, (K, NU), dtype), jax.random.normal(key_e, (K, NDX), dtype)
+    )
 
 
 @pytest.mark.parametrize("mu", [0.1, 10.0, 1e5])
@@ -63,9 +65,9 @@ def test_step_is_newtons_and_multipliers_follow_the_predicted_defect(mu, seed):
     H, g, J = dense(model, cost)
     h, lam = model.h.ravel(), multipliers.ravel()
     d = -np.linalg.solve(H + mu * J.T @ J, g + J.T @ (lam + mu * h))
-    dx, du, _, _, rate = newton(model, cost, multipliers, mu, KEY)
-    np.testing.assert_allclose(flat(dx, du), d, rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(np.ravel(rate), mu * (h + J @ d), rtol=1e-7, atol=1e-5)
+    step = newton(model, cost, multipliers, mu, white(KEY))
+    np.testing.assert_allclose(flat(step.dx, step.du), d, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(np.ravel(step.rate), mu * (h + J @ d), rtol=1e-7, atol=1e-5)
 
 
 def test_float32_needs_no_digits_for_the_penalty():
@@ -74,22 +76,21 @@ def test_float32_needs_no_digits_for_the_penalty():
     mu = 1e6  # M has a condition number far beyond 1 / eps
     d = -np.linalg.solve(H + mu * J.T @ J, g + J.T @ (multipliers.ravel() + mu * model.h.ravel()))
     single = jax.tree.map(np.float32, (model, cost, multipliers, mu))
-    dx, du, *_ = newton(*single, KEY)
-    assert dx.dtype == np.float32
-    np.testing.assert_allclose(flat(dx, du), d, rtol=1e-3, atol=1e-3 * np.abs(d).max())
+    step = newton(*single, white(KEY, np.float32))
+    assert step.dx.dtype == np.float32
+    np.testing.assert_allclose(flat(step.dx, step.du), d, rtol=1e-3, atol=1e-3 * np.abs(d).max())
 
 
 @pytest.mark.parametrize("mu", [0.1, 10.0, 1e4])
-def test_noise_covariance_is_exactly_the_inverse_of_M(mu, monkeypatch):
+def test_noise_covariance_is_exactly_the_inverse_of_M(mu):
     model, cost, multipliers = drawn(3)
     H, _, J = dense(model, cost)
 
-    def noise(white):
-        drafts = iter([white[: K * NU].reshape(K, NU), white[K * NU :].reshape(K, NDX)])
-        monkeypatch.setattr(jax.random, "normal", lambda *_: next(drafts))
+    def noise(numbers):
+        drawn = White(numbers[: K * NU].reshape(K, NU), numbers[K * NU :].reshape(K, NDX))
         factors = factorize(model, cost, multipliers, mu)
-        _, _, nx, nu, _ = solve_and_sample(model, factors, multipliers, mu, KEY)
-        return jnp.concatenate([nx.ravel(), nu.ravel()])
+        step = solve_and_sample(model, factors, multipliers, mu, drawn)
+        return jnp.concatenate([step.nx.ravel(), step.nu.ravel()])
 
     zero = np.zeros(K * (NDX + NU))
     assert not np.any(noise(zero))
@@ -102,15 +103,55 @@ def test_sampled_noise_is_white_in_the_metric():
     model, cost, multipliers = drawn(4)
     H, _, J = dense(model, cost)
     mu, samples = 10.0, 20_000
-    keys = jax.random.split(KEY, samples)
-    _, _, nx, nu, _ = jax.vmap(newton, (None, None, None, None, 0))(
-        model, cost, multipliers, mu, keys
-    )
-    n = np.hstack([nx.reshape(samples, -1), nu.reshape(samples, -1)])
-    white = n @ np.linalg.cholesky(H + mu * J.T @ J)  # L'n ~ N(0, I) for M = L L'
-    np.testing.assert_allclose(white.mean(0), 0, atol=6 / samples**0.5)
-    covariance = white.T @ white / samples
+    drawn_white = jax.vmap(white)(jax.random.split(KEY, samples))
+    step = jax.vmap(newton, (None, None, None, None, 0))(model, cost, multipliers, mu, drawn_white)
+    n = np.hstack([step.nx.reshape(samples, -1), step.nu.reshape(samples, -1)])
+    whitened = n @ np.linalg.cholesky(H + mu * J.T @ J)  # L'n ~ N(0, I) for M = L L'
+    np.testing.assert_allclose(whitened.mean(0), 0, atol=6 / samples**0.5)
+    covariance = whitened.T @ whitened / samples
     np.testing.assert_allclose(covariance, np.eye(len(H)), atol=6 * (2 / samples) ** 0.5)
+
+
+def batch(chains, dtype):
+    """Different problems for every chain, penalties included."""
+    problems = [drawn(seed) for seed in range(chains)]
+    model, cost, multipliers = jax.tree.map(lambda *a: np.stack(a), *problems)
+    numbers = jax.vmap(white)(jax.random.split(KEY, chains))
+    arguments = model, cost, multipliers, np.geomspace(10.0, 1e4, chains), numbers
+    return jax.tree.map(lambda a: jnp.asarray(a, dtype), arguments)
+
+
+def test_kernel_agrees_with_the_plain_recursion():
+    arguments = batch(37, np.float64)  # one warp, and another that is not full
+    plain = jax.vmap(newton)(*arguments)
+    kernel = newton_batch(*arguments, interpret=True)
+    for name in ("dx", "du", "nx", "nu", "rate", "K"):
+        np.testing.assert_allclose(
+            getattr(kernel, name), getattr(plain, name), rtol=1e-9, atol=1e-9, err_msg=name
+        )
+
+
+def test_kernel_lowers_for_cuda_from_any_machine():
+    arguments = batch(4, np.float32)
+    text = jax.jit(newton_batch).trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("triton") >= 2
+
+
+def test_maps_may_be_nested_and_arguments_shared():
+    model, cost, multipliers, mu, numbers = batch(6, np.float64)
+    cost = jax.tree.map(lambda a: a[0], cost)
+
+    def alone(i):
+        own, numbers_ = jax.tree.map(lambda a: a[i], (model, numbers))
+        return newton(own, cost, multipliers[i], mu[0], numbers_)
+
+    fold = jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), (model, multipliers, numbers))
+    inner = jax.vmap(newton, (0, None, 0, None, 0))
+    nested = jax.vmap(inner, (0, None, 0, None, 0))(fold[0], cost, fold[1], mu[0], fold[2])
+    for name in ("dx", "rate", "K"):
+        flat_ = getattr(nested, name).reshape(6, *getattr(nested, name).shape[2:])
+        expected = np.stack([getattr(alone(i), name) for i in range(6)])
+        np.testing.assert_allclose(flat_, expected, rtol=1e-9, atol=1e-9)
 
 
 def lqr(A, B, cost):
