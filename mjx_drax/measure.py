@@ -1,0 +1,436 @@
+"""One method on one problem, as a row of the benchmark.
+
+Every row has the fields of `FIELDS`; methods add their own. Whoever found a trajectory, it counts
+when the problem's own replay (MuJoCo's C engine, or float64 for functions) ends in the goal.
+
+`time_to_certified_s` is the time of solving until an answer could be handed over that a replay
+certifies, with that replay; compilation, and building IPOPT's program, are left out. It is None if
+there never was one. In detail:
+
+    this solver   The solve is repeated with the same seed and interrupted at some of its reports,
+                  from the first one at which any chain is feasible; what an interrupted solve
+                  returns is replayed. Counted is the time of the first interrupted solve that is
+                  certified. Chains run together, so the time is that of all of them.
+    IPOPT         Starts run one after the other; counted are all until the first that is certified.
+    shooting      Runs go on together; counted is the time until the first report at which the
+                  cheapest rollout of a run is certified.
+
+`curve` holds [seconds, share] pairs: the share of chains, starts or runs that held a certified
+answer after so many seconds, by the same rules.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax.langevin import FEASIBLE, LADDER, Info, Langevin, evaluate
+from mjx_drax.peers import shooting
+from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.reproduce import many
+from mjx_drax.solution import Solution, solve
+
+if TYPE_CHECKING:
+    from mjx_drax.peers.ipopt import Transcription
+
+Row = dict[str, Any]
+
+FIELDS = (
+    "problem",
+    "horizon",
+    "solver",
+    "seed",
+    "chains",
+    "success_rate",
+    "certified",
+    "best_cost",
+    "cost_ratio",
+    "max_defect",
+    "evaluations",
+    "compile_time_s",
+    "solve_time_s",
+    "time_to_certified_s",
+    "curve",
+    "device",
+    "cpus",
+    "jax",
+    "python",
+)
+"""What every row holds; None where a method has no such number."""
+
+OURS = "mjx_drax"
+"""What `solver` says for this library with a task's own settings."""
+
+BEST_KNOWN = {
+    "pendulum": 0.031774,
+    "bug_trap": 18.18,
+    "deep_trap": 48.34,
+    "pendulum_swingup": 2.1514,
+    "cartpole_swingup": 0.22396,
+    "acrobot_swingup": 0.40500,
+}
+"""Lowest costs of certified trajectories, by any method, when this was written. The pendulum's is
+where all of IPOPT's starts end; the others may be undercut, and then `cost_ratio` is below 1."""
+
+PROBES = 8
+"""Largest number of interrupted solves for one row."""
+
+OUTSIDE = 1e-2
+"""How far a replay may leave the bounds of the states."""
+
+STARTS = 20
+"""Largest number of IPOPT's starts for one row."""
+
+TUNING = 10_000
+"""Added to a seed for the runs that choose a shooting method's settings."""
+
+
+def machine() -> Row:
+    """What a row was measured on."""
+    device = jax.devices()[0]
+    return {
+        "device": device.device_kind,
+        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def row(problem: Problem, solver: str, seed: int, chains: int, **found: Any) -> Row:
+    """A row; what is not given is None."""
+    given = {
+        "problem": problem.name,
+        "horizon": problem.horizon,
+        "solver": solver,
+        "seed": seed,
+        "chains": chains,
+        **machine(),
+        **found,
+    }
+    cost, best = given.get("best_cost"), BEST_KNOWN.get(problem.name)
+    if cost is not None and best is not None and given.get("certified"):
+        given["cost_ratio"] = cost / best
+    return {name: given.get(name) for name in FIELDS} | given
+
+
+# This solver
+
+
+def ours(
+    problem: Problem,
+    solver: Langevin,
+    chains: int,
+    seed: int,
+    name: str = OURS,
+    probes: int = PROBES,
+) -> Row:
+    """A solve, and when its first answer was there; with probes=0, only when its last one was."""
+    solution = solve(problem, chains, seed, solver)
+    replay = _seconds_of_a_replay(solution)
+    curve = [
+        (seconds + replay, share, certified)
+        for seconds, share, certified in (*_interrupted(solution, probes), _judged(solution))
+    ]
+    best, certificate = solution.best_chain, solution.certificate
+    return row(
+        problem,
+        name,
+        seed,
+        chains,
+        iterations=solution.iterations,
+        success_rate=solution.success_rate,
+        certified=solution.certified,
+        best_cost=float(solution.cost[best]),
+        max_defect=float(solution.max_defect[best]),
+        evaluations=evaluations(solver, problem, chains),
+        open_loop_deviation=certificate.open_loop["max_deviation"],
+        feedback_deviation=certificate.feedback["max_deviation"],
+        median_success_cost=float(np.median(solution.cost[solution.success]))
+        if solution.success.any()
+        else None,
+        compile_time_s=solution.compile_time,
+        solve_time_s=solution.solve_time,
+        time_to_certified_s=next((t for t, _, certified in curve if certified), None),
+        curve=[[seconds, share] for seconds, share, _ in curve],
+    )
+
+
+def evaluations(solver: Langevin, problem: Problem, chains: int) -> int:
+    """Evaluations of f that a solve costs.
+
+    Per knot, an iteration linearizes, 1 + ndx + nu evaluations (forward mode, or one reverse sweep
+    for less), and one of the tail also tries every step size of its ladder.
+    """
+    dynamics = problem.dynamics
+    linearization = 1 + dynamics.ndx + dynamics.nu
+    total, tail = int(solver.iterations) + int(solver.tail), int(solver.tail)
+    return chains * problem.horizon * (total * linearization + tail * len(LADDER))
+
+
+def _interrupted(solution: Solution, probes: int) -> list[tuple[float, float, bool]]:
+    """Seconds, share of chains that succeed, and whether certified, of the solve cut short."""
+    history = solution.history
+    feasible = (history["max_defect"] < FEASIBLE).any(axis=1)
+    stops = history["iteration"][feasible & (history["iteration"] > 0)][:-1]
+    if len(stops) == 0 or probes == 0:
+        return []
+    chosen = stops[np.unique(np.linspace(0, len(stops) - 1, probes).round().astype(int))]
+    answers = []
+    for stop in chosen:
+
+        def interrupt(done: int, total: int, info: Info, stop: int = int(stop)) -> None:
+            if done >= stop:
+                raise KeyboardInterrupt  # which keeps what there is
+
+        part = solve(
+            solution.problem, solution.chains, solution.seed, solution.solver, progress=interrupt
+        )
+        answers.append(_judged(part))
+    return answers
+
+
+def _judged(solution: Solution) -> tuple[float, float, bool]:
+    return solution.solve_time, solution.success_rate, solution.certified
+
+
+def _seconds_of_a_replay(solution: Solution) -> float:
+    """Time to replay the best chain [s], once compiled."""
+    problem, chain = solution.problem, solution.best_chain
+    plan = np.asarray(problem.with_start(solution.best), float)[None]
+    u, gains = solution.trajectories.u[chain][None], solution.gains[chain][None]
+    return _seconds(problem, plan, np.asarray(u, float), gains.astype(float))
+
+
+# Peers
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What open-loop replays came to: success and cost, (n,) each, and the time of one [s]."""
+
+    success: np.ndarray
+    cost: np.ndarray
+    seconds: float
+
+
+def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> Verdicts:
+    """Replay controls (n, K, nu) from x_init, the problem's or (n, nx), as certificates do.
+
+    A replay succeeds that reaches the goal and leaves the states' bounds by `OUTSIDE` at most.
+    """
+    dynamics, bounds, count = problem.dynamics, problem.bounds, len(u)
+    plan = np.zeros((count, problem.horizon + 1, dynamics.nx))
+    plan[:, 0] = np.asarray(problem.x_init, float) if x_init is None else x_init
+    gains = np.zeros((*u.shape, dynamics.ndx))
+    states, applied = dynamics.replay(plan, np.asarray(u, float), gains, _limits(problem))
+    below = np.asarray(bounds.x_lower) - states[:, 1:]
+    above = states[:, 1:] - np.asarray(bounds.x_upper)
+    inside = np.maximum(below, above).max(axis=(1, 2)) < OUTSIDE
+    success = [
+        bool(ok and np.isfinite(x).all() and problem.reached(x[-1]) is not False)
+        for ok, x in zip(inside, states, strict=True)
+    ]
+    knots = Trajectory(jnp.asarray(states[:, 1:], float), jnp.asarray(applied, float))
+    return Verdicts(
+        np.array(success),
+        np.asarray(evaluate(problem, knots).cost),
+        _seconds(problem, plan[:1], np.asarray(u[:1], float), gains[:1]),
+    )
+
+
+def _seconds(problem: Problem, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> float:
+    for _ in range(2):  # the first compiles
+        clock = time.perf_counter()
+        problem.dynamics.replay(plan, u, gains, _limits(problem))
+    return time.perf_counter() - clock
+
+
+def _limits(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(problem.bounds.u_lower, float), np.asarray(problem.bounds.u_upper, float)
+
+
+def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | None = None) -> Row:
+    """IPOPT from random knots, one start after the other on one thread.
+
+    Raises:
+        DraxError: casadi is not installed, or the problem is not written for it.
+    """
+    from mjx_drax.peers.ipopt import Transcription
+
+    clock = time.perf_counter()
+    program = program or Transcription(problem)
+    building = time.perf_counter() - clock
+    found = program.multistart(starts, seed)
+    verdicts = judge(problem, np.stack([start.u for start in found]))
+    defects, costs = (np.array([getattr(s, k) for s in found]) for k in ("max_defect", "cost"))
+    success = verdicts.success & (defects < FEASIBLE)
+    times = np.cumsum([start.seconds for start in found])
+    eligible = success if success.any() else defects < FEASIBLE
+    best = int(np.argmin(np.where(eligible, costs, np.inf)))
+    certified = bool(success.any())
+    return row(
+        problem,
+        "ipopt",
+        seed,
+        starts,
+        iterations=None,
+        success_rate=float(success.mean()),
+        certified=certified,
+        best_cost=float(costs[best]),
+        max_defect=float(defects[best]),
+        median_start_s=float(np.median([start.seconds for start in found])),
+        costs=sorted(round(float(cost), 6) for cost in costs),
+        compile_time_s=building,
+        solve_time_s=float(times[-1]),
+        time_to_certified_s=float(times[np.argmax(success)]) + verdicts.seconds
+        if certified
+        else None,
+        curve=[
+            [float(t) + verdicts.seconds, float(share)]
+            for t, share in zip(times, np.cumsum(success) / starts, strict=True)
+        ],
+    )
+
+
+def shoot(
+    problem: Problem, method: shooting.Method, runs: int, samples: int, budget: int, seed: int
+) -> Row:
+    """A shooting method with a budget of evaluations of f, spent on independent runs."""
+    result = shooting.optimize(method, problem, runs, samples, budget, seed)
+    reports = len(result.seconds)
+    verdicts = judge(problem, result.u.reshape(-1, *result.u.shape[2:]))
+    success = verdicts.success.reshape(reports, runs)
+    last, cost = success[-1], verdicts.cost.reshape(reports, runs)[-1]
+    best = int(np.argmin(np.where(last if last.any() else np.isfinite(cost), cost, np.inf)))
+    any_at = success.any(axis=1)
+    seconds = result.seconds + verdicts.seconds
+    return row(
+        problem,
+        method.name,
+        seed,
+        runs,
+        iterations=result.iterations,
+        samples=samples,
+        settings={name: float(value) for name, value in asdict(method).items()},  # type: ignore[call-overload]
+        success_rate=float(last.mean()),
+        certified=bool(last.any()),
+        best_cost=float(cost[best]),
+        max_defect=0.0,
+        evaluations=result.evaluations,
+        compile_time_s=result.compile_time,
+        solve_time_s=float(result.seconds[-1]),
+        time_to_certified_s=float(seconds[np.argmax(any_at)]) if any_at.any() else None,
+        curve=[
+            [float(t), float(share)] for t, share in zip(seconds, success.mean(axis=1), strict=True)
+        ],
+    )
+
+
+def tuned(
+    problem: Problem,
+    methods: Sequence[shooting.Method],
+    runs: int,
+    samples: int,
+    budget: int,
+    seed: int,
+) -> shooting.Method:
+    """The settings with the highest success, then the lowest cost, each with the whole budget.
+
+    They are tried with another seed than the one that is reported.
+    """
+    rows = [shoot(problem, m, runs, samples, budget, seed + TUNING) for m in methods]
+    order = [(-r["success_rate"], r["best_cost"]) for r in rows]
+    return methods[min(range(len(methods)), key=lambda i: order[i])]
+
+
+# Many problems at once
+
+
+def random_states(
+    problem: Problem,
+    solver: Langevin,
+    count: int,
+    seed: int,
+    sample: int = 50,
+    starts: int = 4,
+    program: Transcription | None = None,
+) -> Row:
+    """One chain for each of many initial states, U(-4, 4) in every element.
+
+    Not every one can reach the goal, so the row says what share is feasible to 1e-5, and, on the
+    first `sample` states, the cost against the lowest of IPOPT's `starts` (left out without
+    `program`). States and random keys are the same however many there are. `best_cost` and
+    `max_defect` are medians over the states, `chains` their number.
+    """
+    key_states, key_chains = jax.random.split(jax.random.key(seed))
+    index = jnp.arange(count)
+    keys, chain_keys = (
+        jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, index)
+        for key in (key_states, key_chains)
+    )
+    nx = problem.dynamics.nx
+    states = jax.vmap(lambda k: jax.random.uniform(k, (nx,), minval=-4.0, maxval=4.0))(keys)
+    total, tail = int(solver.iterations) + int(solver.tail), int(solver.tail) > 0
+    clock = time.perf_counter()
+    compiled = many.lower(solver, problem, states, chain_keys, total, tail).compile()
+    jax.block_until_ready(compiled(solver, problem, states, chain_keys))  # loads, allocates
+    compile_time = time.perf_counter() - clock
+    clock = time.perf_counter()
+    trajectory, info = jax.block_until_ready(compiled(solver, problem, states, chain_keys))
+    seconds = time.perf_counter() - clock
+    defect, cost = np.asarray(info.max_defect), np.asarray(info.cost)
+    success = judge(problem, np.asarray(trajectory.u), np.asarray(states, float)).success
+    feasible = defect < 1e-5
+    found: Row = {
+        "problem": f"{problem.name}, random x_init",
+        "iterations": total,
+        "share_feasible_1e-5": float(feasible.mean()),
+        "share_feasible_1e-3": float((defect < FEASIBLE).mean()),
+        "sample_x_init": np.asarray(states[:sample]).tolist(),
+        "sample_cost": [float(c) if np.isfinite(c) else None for c in cost[:sample]],
+        "sample_max_defect": [float(h) if np.isfinite(h) else None for h in defect[:sample]],
+    }
+    if program is not None:
+        found |= _against_ipopt(program, np.asarray(states[:sample], float), cost, defect, starts)
+    return row(problem, OURS, seed, count) | {
+        "success_rate": float(np.mean(success & (defect < FEASIBLE))),
+        "certified": bool(np.any(success & (defect < FEASIBLE))),
+        "best_cost": float(np.median(cost)),
+        "max_defect": float(np.median(defect)),
+        "evaluations": evaluations(solver, problem, count),
+        "compile_time_s": compile_time,
+        "solve_time_s": seconds,
+        **found,
+    }
+
+
+def _against_ipopt(
+    program: Transcription, states: np.ndarray, cost: np.ndarray, defect: np.ndarray, starts: int
+) -> Row:
+    """Costs of the first states against the lowest feasible cost of IPOPT from each."""
+    best, seconds = [], 0.0
+    for i, x_init in enumerate(states):
+        found = program.multistart(starts, i, x_init)
+        seconds += sum(start.seconds for start in found)
+        best.append(min((s.cost for s in found if s.max_defect < FEASIBLE), default=np.inf))
+    reference, own = np.array(best), cost[: len(states)]
+    solved = np.isfinite(reference) & (defect[: len(states)] < FEASIBLE)
+    ratio = own[solved] / reference[solved]
+    return {
+        "cost_ratio": float(np.median(ratio)) if len(ratio) else None,
+        "sample_ipopt_cost": [float(c) if np.isfinite(c) else None for c in reference],
+        "sample_ipopt_starts": starts,
+        "sample_ipopt_time_s": seconds,
+        "sample_feasible": int((defect[: len(states)] < FEASIBLE).sum()),
+        "sample_within_1_percent": float(np.sum(ratio < 1.01) / len(states)),
+        "sample_within_10_percent": float(np.sum(ratio < 1.1) / len(states)),
+        "sample_cost_ratio_p90": float(np.quantile(ratio, 0.9)) if len(ratio) else None,
+    }
