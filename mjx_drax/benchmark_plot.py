@@ -58,7 +58,10 @@ def plot(rows: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
     handles = {h.get_label(): h for axis in axes for h in axis.get_legend_handles_labels()[0]}
     if handles:
         figure.legend(
-            handles=list(handles.values()), loc="outside lower center", ncols=5, fontsize=8
+            handles=list(handles.values()),
+            loc="outside lower center",
+            ncols=3 * columns,
+            fontsize=8,
         )
     target = Path(path)
     FigureCanvasAgg(figure).print_png(target)
@@ -96,15 +99,8 @@ def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> 
     axes.grid(True, color="0.9", lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     if failed:
-        axes.text(
-            0.02,
-            0.97,
-            "none: " + ", ".join(failed),
-            transform=axes.transAxes,
-            va="top",
-            fontsize=7,
-            wrap=True,
-        )
+        label = "never: " + ", ".join(failed)
+        axes.set_title(label, loc="right", fontsize=7)
 
 
 def pooled(

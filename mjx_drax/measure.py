@@ -13,7 +13,8 @@ there never was one. In detail:
                   certified. Chains run together, so the time is that of all of them.
     IPOPT         Starts run one after the other; counted are all until the first that is certified.
     shooting      Runs go on together; counted is the time until the first report at which the
-                  cheapest rollout of a run is certified.
+                  cheapest rollout of a run is certified. A run that once held a certified answer
+                  has succeeded, whatever it found later.
 
 `curve` holds [seconds, share] pairs: the share of chains, starts or runs that held a certified
 answer after so many seconds, by the same rules.
@@ -26,11 +27,13 @@ import platform
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from mjx_drax.langevin import FEASIBLE, LADDER, Info, Langevin, evaluate
 from mjx_drax.peers import shooting
@@ -135,10 +138,9 @@ def ours(
     """A solve, and when its first answer was there; with probes=0, only when its last one was."""
     solution = solve(problem, chains, seed, solver)
     replay = _seconds_of_a_replay(solution)
-    curve = [
-        (seconds + replay, share, certified)
-        for seconds, share, certified in (*_interrupted(solution, probes), _judged(solution))
-    ]
+    answers = [*_interrupted(solution, probes), _judged(solution)]
+    seconds, shares, certified = zip(*answers, strict=True)
+    times = (np.maximum.accumulate(seconds) + replay).tolist()  # solves are timed with some noise
     best, certificate = solution.best_chain, solution.certificate
     return row(
         problem,
@@ -158,8 +160,8 @@ def ours(
         else None,
         compile_time_s=solution.compile_time,
         solve_time_s=solution.solve_time,
-        time_to_certified_s=next((t for t, _, certified in curve if certified), None),
-        curve=[[seconds, share] for seconds, share, _ in curve],
+        time_to_certified_s=next((t for t, ok in zip(times, certified, strict=True) if ok), None),
+        curve=[list(pair) for pair in zip(times, shares, strict=True)],
     )
 
 
@@ -307,11 +309,11 @@ def shoot(
     result = shooting.optimize(method, problem, runs, samples, budget, seed)
     reports = len(result.seconds)
     verdicts = judge(problem, result.u.reshape(-1, *result.u.shape[2:]))
-    success = verdicts.success.reshape(reports, runs)
-    last, cost = success[-1], verdicts.cost.reshape(reports, runs)[-1]
-    best = int(np.argmin(np.where(last if last.any() else np.isfinite(cost), cost, np.inf)))
-    any_at = success.any(axis=1)
-    seconds = result.seconds + verdicts.seconds
+    certified = verdicts.success
+    eligible = certified if certified.any() else np.isfinite(verdicts.cost)
+    cost = np.where(eligible, verdicts.cost, np.inf).min()
+    held = np.logical_or.accumulate(certified.reshape(reports, runs), axis=0)
+    share, seconds = held.mean(axis=1), result.seconds + verdicts.seconds
     return row(
         problem,
         method.name,
@@ -320,17 +322,15 @@ def shoot(
         iterations=result.iterations,
         samples=samples,
         settings={name: float(value) for name, value in asdict(method).items()},  # type: ignore[call-overload]
-        success_rate=float(last.mean()),
-        certified=bool(last.any()),
-        best_cost=float(cost[best]),
+        success_rate=float(share[-1]),
+        certified=bool(certified.any()),
+        best_cost=float(cost),
         max_defect=0.0,
         evaluations=result.evaluations,
         compile_time_s=result.compile_time,
         solve_time_s=float(result.seconds[-1]),
-        time_to_certified_s=float(seconds[np.argmax(any_at)]) if any_at.any() else None,
-        curve=[
-            [float(t), float(share)] for t, share in zip(seconds, success.mean(axis=1), strict=True)
-        ],
+        time_to_certified_s=float(seconds[np.argmax(share > 0)]) if certified.any() else None,
+        curve=[[float(t), float(s)] for t, s in zip(seconds, share, strict=True)],
     )
 
 
@@ -370,14 +370,7 @@ def random_states(
     `program`). States and random keys are the same however many there are. `best_cost` and
     `max_defect` are medians over the states, `chains` their number.
     """
-    key_states, key_chains = jax.random.split(jax.random.key(seed))
-    index = jnp.arange(count)
-    keys, chain_keys = (
-        jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, index)
-        for key in (key_states, key_chains)
-    )
-    nx = problem.dynamics.nx
-    states = jax.vmap(lambda k: jax.random.uniform(k, (nx,), minval=-4.0, maxval=4.0))(keys)
+    states, chain_keys = random_starts(problem.dynamics.nx, count, seed)
     total, tail = int(solver.iterations) + int(solver.tail), int(solver.tail) > 0
     clock = time.perf_counter()
     compiled = many.lower(solver, problem, states, chain_keys, total, tail).compile()
@@ -410,6 +403,16 @@ def random_states(
         "solve_time_s": seconds,
         **found,
     }
+
+
+def random_starts(nx: int, count: int, seed: int) -> tuple[Array, Array]:
+    """Initial states (count, nx) from U(-4, 4), and a key for each one's chain."""
+    keys = jax.random.split(jax.random.key(seed))
+    of_states, of_chains = (
+        jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(count)) for key in keys
+    )
+    draw = partial(jax.random.uniform, shape=(nx,), minval=-4.0, maxval=4.0)
+    return jax.vmap(draw)(of_states), of_chains
 
 
 def _against_ipopt(

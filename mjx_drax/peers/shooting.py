@@ -192,7 +192,7 @@ def average(v: Array, cost: Array, temperature: ArrayLike) -> Array:
     Measured in standard deviations of the costs at hand, a temperature means the same for every
     problem and at every stage of the search.
     """
-    scale = temperature * jnp.maximum(jnp.std(cost), jnp.finfo(cost.dtype).tiny)
+    scale = jnp.maximum(temperature * jnp.std(cost), jnp.finfo(cost.dtype).tiny)
     return jnp.tensordot(jax.nn.softmax(-(cost - cost.min()) / scale), v, axes=1)
 
 
