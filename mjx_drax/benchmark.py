@@ -235,8 +235,9 @@ def _task(name: str) -> tuple[Problem, Langevin, int]:
 
 
 HEADER = (
-    "| problem | K | solver | seed | chains | success | best cost | / best known | max\\|h\\| "
-    "| f evaluations | first certified [s] | solve [s] | compile [s] |\n" + "|---" * 13 + "|"
+    "| problem | K | solver | seed | chains | success | near best | best cost | / best known "
+    "| max\\|h\\| | f evaluations | first certified [s] | first near [s] | solve [s] "
+    "| compile [s] |\n" + "|---" * 15 + "|"
 )
 
 
@@ -248,9 +249,11 @@ def line(row: Row) -> str:
 
     return (
         f"| {row['problem']} | {row['horizon']} | {row['solver']} | {row['seed']} "
-        f"| {row['chains']} | {cell('success_rate', '.1%')} | {cell('best_cost', '.6g')} "
+        f"| {row['chains']} | {cell('success_rate', '.1%')} | {cell('near_rate', '.1%')} "
+        f"| {cell('best_cost', '.6g')} "
         f"| {cell('cost_ratio', '.4f')} | {cell('max_defect', '.0e')} "
         f"| {cell('evaluations', '.2g')} | {cell('time_to_certified_s', '.3g')} "
+        f"| {cell('time_to_near_s', '.3g')} "
         f"| {cell('solve_time_s', '.3g')} | {cell('compile_time_s', '.1f')} |"
     )
 

@@ -1,9 +1,10 @@
 """Success against time, a panel for each problem.
 
 A curve is the share of chains (IPOPT: starts; shooting: runs) of all seeds together that held a
-certified answer after so many seconds of solving; `measure` says how it is found out. It starts at
-the earliest answer and ends where the last of its solves ended; a method that never found one is
-named in the panel. Colors are Okabe and Ito's; dashes and markers say the same without colour.
+certified answer at no more than twice the best known cost after so many seconds of solving;
+`measure` says how it is found out. It starts at the earliest answer and ends where the last of its
+solves ended; a method that never found one is named above the panel. Colors are Okabe and Ito's;
+dashes and markers say the same without colour.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> 
     axes.set_yticks(np.linspace(0, 1, 6), [f"{tick:.0%}" for tick in np.linspace(0, 1, 6)])
     axes.set_title(title, loc="left", fontsize=9, fontweight="bold")
     axes.set_xlabel("solving time [s]", fontsize=8)
-    axes.set_ylabel("share with a certified answer", fontsize=8)
+    axes.set_ylabel("certified, cost at most 2 × best known", fontsize=8)
     axes.tick_params(labelsize=8)
     axes.grid(True, color="0.9", lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
@@ -106,14 +107,14 @@ def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> 
 def pooled(
     curves: Sequence[Sequence[Sequence[float]]], weights: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Step functions of several seeds as one: times, and the weighted mean of the shares.
+    """Curves of several seeds as one: times, and the weighted mean of their last shares.
 
     A curve is 0 before its first time and keeps its last value.
     """
-    times = np.unique([t for curve in curves for t, _ in curve])
+    times = np.unique([point[0] for curve in curves for point in curve])
     total = np.zeros(len(times))
     for curve, weight in zip(curves, weights, strict=True):
-        t, share = np.array(curve, float).T
+        t, _, share = np.array(curve, float).T
         at = np.searchsorted(t, times, side="right")
         total += weight * np.append(0.0, share)[at]
     return times, total / sum(weights)

@@ -144,7 +144,7 @@ def test_ipopt_finds_the_pendulums_optimum():
     assert row["success_rate"] == 1.0
     assert row["best_cost"] == pytest.approx(0.031774, rel=1e-4)
     assert row["time_to_certified_s"] < row["solve_time_s"]
-    assert [share for _, share in row["curve"]] == [0.5, 1.0]
+    assert [point[1:] for point in row["curve"]] == [[0.5, 0.5], [1.0, 1.0]]
 
 
 def test_peers_without_casadi_say_what_to_install(monkeypatch, tmp_path, capsys):
@@ -172,7 +172,7 @@ def test_first_certified_answer_comes_before_the_last_iteration():
     problem = double_integrator()
     solver = Langevin(iterations=5, tail=95, noise=Geometric(0.1, 0.01))
     row = measure.ours(problem, solver, 2, seed=0)
-    times = [seconds for seconds, _ in row["curve"]]
+    times = [point[0] for point in row["curve"]]
     assert times == sorted(times)
     assert row["time_to_certified_s"] == times[0] < times[-1]
     hopeless = replace(problem, aside=replace(problem.aside, goal=lambda x: False))
@@ -182,8 +182,18 @@ def test_first_certified_answer_comes_before_the_last_iteration():
     assert row["cost_ratio"] is None
 
 
+def test_an_answer_far_above_the_best_known_cost_is_not_near_it(monkeypatch):
+    problem, row = double_integrator(), {}
+    for best, share in ((least_cost(), 1.0), (0.1 * least_cost(), 0.0)):
+        monkeypatch.setitem(measure.BEST_KNOWN, problem.name, best)
+        row = measure.shoot(problem, METHODS[1], 1, 128, 128 * KNOTS * 50, seed=0)
+        assert (row["success_rate"], row["near_rate"]) == (1.0, share)
+    assert row["time_to_near_s"] is None
+    assert row["time_to_certified_s"] > 0
+
+
 def test_pooled_curves_are_weighted_and_end_where_they_end():
-    times, share = pooled([[[1.0, 0.5], [3.0, 1.0]], [[2.0, 1.0]]], [3, 1])
+    times, share = pooled([[[1.0, 0.9, 0.5], [3.0, 1.0, 1.0]], [[2.0, 1.0, 1.0]]], [3, 1])
     assert times.tolist() == [1.0, 2.0, 3.0]
     np.testing.assert_allclose(share, [0.375, 0.625, 1.0])
 
