@@ -153,10 +153,12 @@ def _peers(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> It
                 yield ipopt(problem, min(number, STARTS), seed, program)
         runs = max(number // CHAINS_PER_RUN, 1)
         for methods in SHOOTING.values():
-            best = tuned(problem, methods, runs, SAMPLES, budget, seeds[0])
+            best, compilation = tuned(problem, methods, runs, SAMPLES, budget, seeds[0])
             for seed in seeds:
                 found = shoot(problem, best, runs, SAMPLES, budget, seed)
+                found["compile_time_s"] += compilation
                 yield found | {"settings_tried": len(methods)}
+                compilation = 0.0
     if "pendulum" in names:
         yield from _random_pendulums(min(chains or 50, 50), seeds)
 

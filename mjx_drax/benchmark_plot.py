@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.plotting import BLACK, BLUE, DPI, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 
@@ -89,6 +90,9 @@ def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> 
             **style,
         )
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
     if ends:
         axes.set_xlim(0.7 * min(ends), 1.4 * max(ends))
     axes.set_ylim(0.0, 1.0)
