@@ -373,7 +373,7 @@ def _solve_many(solver: Langevin, problem: Problem, starts: Array, key: Array) -
     total = int(solver.iterations) + int(solver.tail)
     keys = jax.random.split(key, len(starts))
     tail = int(solver.tail) > 0
-    compiled = _many.lower(solver, problem, starts, keys, total, tail).compile()
+    compiled = many.lower(solver, problem, starts, keys, total, tail).compile()
     jax.block_until_ready(compiled(solver, problem, starts, keys))  # loads, allocates
     clock = time.perf_counter()
     trajectory, info = jax.block_until_ready(compiled(solver, problem, starts, keys))
@@ -388,7 +388,7 @@ def _solve_many(solver: Langevin, problem: Problem, starts: Array, key: Array) -
 
 
 @partial(jax.jit, static_argnames=("total", "tail"))
-def _many(
+def many(
     solver: Langevin, problem: Problem, starts: Array, keys: Array, total: int, tail: bool
 ) -> tuple[Trajectory, Info]:
     """One chain for each initial state: knots (N, K, ...) and diagnostics (N,) at the end.

@@ -135,6 +135,6 @@ def test_errors_name_cause_and_fix(own, capsys):
 
 def test_benchmark_prints_and_saves_rows(tmp_path, capsys):
     main(["benchmark", "pendulum", "--seeds", "0", "--chains", "4", "--out", str(tmp_path)])
-    rows = json.loads((tmp_path / "benchmark.json").read_text())["rows"]
+    rows = json.loads((tmp_path / "benchmark.json").read_text())
     assert [(row["problem"], row["chains"]) for row in rows] == [("pendulum", 4)]
     assert f"{rows[0]['success_rate']:.1%}" in capsys.readouterr().out

@@ -86,7 +86,7 @@ def test_batched_problems_start_where_they_should():
     problem, solver = reproduce._task("pendulum")
     starts = jnp.array([[3.1, 0.0], [3.0, 0.2], [-3.1, 0.0], [3.2, -0.1]])
     keys = jax.random.split(jax.random.key(0), 4)
-    trajectory, info = reproduce._many(solver, problem, starts, keys, 200, True)
+    trajectory, info = reproduce.many(solver, problem, starts, keys, 200, True)
     for i in range(4):
         own = problem.with_x_init(starts[i])
         one = jax.tree.map(lambda a, i=i: a[i], trajectory)
