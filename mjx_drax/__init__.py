@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mjx_drax.program import minimize as minimize
     from mjx_drax.quasi_newton import LBFGS as LBFGS
     from mjx_drax.rendering import render as render
+    from mjx_drax.restarts import Restarts as Restarts
     from mjx_drax.schedules import Constant as Constant
     from mjx_drax.schedules import Geometric as Geometric
     from mjx_drax.solution import Solution as Solution
@@ -58,6 +59,7 @@ _HOME = {
     "Trajectory": "problem",
     "from_function": "problem",
     "render": "rendering",
+    "Restarts": "restarts",
     "Constant": "schedules",
     "Geometric": "schedules",
     "Solution": "solution",

@@ -21,11 +21,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from mjx_drax import tasks
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import Langevin
+from mjx_drax.langevin import Langevin, evaluate
 from mjx_drax.measure import OURS, STARTS, Row, ipopt, ours, random_states, shoot, tuned
 from mjx_drax.peers.cem import CEM
 from mjx_drax.peers.ipopt import FUNCTIONS, Transcription, require_casadi
@@ -33,6 +34,7 @@ from mjx_drax.peers.mbd import MBD
 from mjx_drax.peers.mppi import MPPI
 from mjx_drax.precondition import Diagonal
 from mjx_drax.reproduce import PENDULUM_FLOW, TRAP_FLOW
+from mjx_drax.restarts import Restarts, unit_of
 from mjx_drax.schedules import Geometric
 
 if TYPE_CHECKING:
@@ -138,7 +140,7 @@ def _peers(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> It
     for name in names:
         problem, solver, number = _task(name)
         number = chains or number
-        solvers = {OURS: solver}
+        solvers: dict[str, Langevin | Restarts] = {OURS: solver}
         if name in FUNCTIONS:
             solvers |= ablations(problem, solver)
         for label, own in solvers.items():
@@ -171,19 +173,25 @@ SUITES: dict[str, tuple[Callable[..., Iterator[Row]], Callable[[], Sequence[str]
 """What measures a suite, and the tasks that it has."""
 
 
-def ablations(problem: Problem, solver: Langevin) -> dict[str, Langevin]:
+def ablations(problem: Problem, solver: Restarts) -> dict[str, Langevin | Restarts]:
     """The solver with one part taken out.
 
-    `no noise`, `diagonal` and `no tail` keep everything else, and the number of iterations.
+    `no restarts` makes the first, noise-free attempt only; `no noise`, `diagonal` and `no tail`
+    keep everything else, and the number of iterations.
     `identity` is the paper's flow, with its own settings and 20,000 iterations: the identity metric
     is unstable at the step size of the others.
     """
-    total = int(solver.iterations) + int(solver.tail)
+    flow = solver.flow
+
+    def with_flow(**settings: Any) -> Restarts:
+        return replace(solver, flow=replace(flow, **settings))
+
     return {
-        "no noise": replace(solver, noise=Geometric(0.0, 0.0)),
-        "diagonal": replace(solver, preconditioner=Diagonal()),
+        "no restarts": replace(solver, attempts=1),
+        "no noise": with_flow(noise=Geometric(0.0, 0.0)),
+        "diagonal": with_flow(preconditioner=Diagonal()),
         "identity": PENDULUM_FLOW if problem.name == "pendulum" else TRAP_FLOW,
-        "no tail": replace(solver, iterations=total, tail=0),
+        "no tail": with_flow(iterations=flow.iterations + flow.tail, tail=0),
     }
 
 
@@ -213,9 +221,11 @@ def one_thread(seed: int, chains: Sequence[int] = ONE_THREAD_CHAINS) -> list[Row
 
 def _random_pendulums(count: int, seeds: Sequence[int]) -> Iterator[Row]:
     problem, solver, _ = _task("pendulum")
+    knots = jax.vmap(problem.draw)(jax.random.split(jax.random.key(0), 1024))
+    first = solver.first(unit_of(np.asarray(evaluate(problem, knots).cost)))
     program = Transcription(problem) if has_casadi() else None
     for seed in seeds:
-        yield random_states(problem, solver, count, seed, program=program)
+        yield random_states(problem, first, count, seed, program=program)
 
 
 def has_casadi() -> bool:
@@ -227,10 +237,10 @@ def has_casadi() -> bool:
     return True
 
 
-def _task(name: str) -> tuple[Problem, Langevin, int]:
-    """Problem, settings and number of chains of a task."""
+def _task(name: str) -> tuple[Problem, Restarts, int]:
+    """Problem, settings (the default for all) and number of chains of a task."""
     task = tasks.load(name)
-    return task.make(), getattr(task, "SOLVER", None) or Langevin(), getattr(task, "CHAINS", 64)
+    return task.make(), Restarts(), getattr(task, "CHAINS", 64)
 
 
 # Results

@@ -4,6 +4,11 @@
 
     b(z) = - sum_i [ log(z_i - lower_i) + log(upper_i - z_i) ].
 
+In the noise-free tail the barrier's curvature is that of a primal-dual interior point method: with
+a multiplier v for each bound, v / slack instead of rho / slack^2. On the central path v = rho /
+slack and the two agree; away from it the first is right about a bound that has just become active,
+and Newton's steps stay good while rho falls (S. Wright, Primal-Dual Interior-Point Methods, 1997).
+
 Two measures keep it finite under noise in float32: derivatives see a slack no smaller than a floor
 (so that 1/slack^2 cannot overflow), and a step may use up at most a fixed fraction of each
 element's own slack, so no element ever leaves its bounds. `Reflection` folds a step that would
@@ -14,6 +19,7 @@ the box. These two add nothing to the cost.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +28,12 @@ from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.problem import Box, Trajectory
+
+FOLLOW = 100.0
+"""Largest factor between a bound's multiplier and rho / slack."""
+
+Sides = tuple[Trajectory, Trajectory]
+"""Numbers of the lower and of the upper ends, shaped like the knots."""
 
 
 @register_dataclass
@@ -50,19 +62,60 @@ class LogBarrier:
             knots = (knots + logs.slack.stage).at[-1].add(logs.slack.terminal)
         return -knots
 
-    def derivatives(self, box: Box, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
-        """Gradient and diagonal of the Hessian of b, each shaped like the trajectory."""
+    def derivatives(
+        self, box: Box, trajectory: Trajectory, weight: ArrayLike, multipliers: Sides | None = None
+    ) -> tuple[Trajectory, Trajectory]:
+        """Gradient of rho b, and its curvature as a diagonal, each shaped like the trajectory.
+
+        With multipliers v the curvature is v / slack; without, v = rho / slack, it is b's own.
+        """
         lower, upper = box.sides(trajectory)
+        central = self.multipliers(box, trajectory, weight)
+        below, above = multipliers or central
 
-        def gradient(z: Array, a: Array, b: Array) -> Array:
-            return _inverse(self._slack(b - z), b) - _inverse(self._slack(z - a), a)
-
-        def curvature(z: Array, a: Array, b: Array) -> Array:
-            return _inverse(self._slack(b - z), b) ** 2 + _inverse(self._slack(z - a), a) ** 2
+        def curvature(z: Array, a: Array, b: Array, v_a: Array, v_b: Array) -> Array:
+            return v_a * _inverse(self._slack(z - a), a) + v_b * _inverse(self._slack(b - z), b)
 
         return (
-            jax.tree.map(gradient, trajectory, lower, upper),
-            jax.tree.map(curvature, trajectory, lower, upper),
+            jax.tree.map(lambda v_a, v_b: v_b - v_a, *central),
+            jax.tree.map(curvature, trajectory, lower, upper, below, above),
+        )
+
+    def multipliers(self, box: Box, trajectory: Trajectory, weight: ArrayLike) -> Sides:
+        """Multipliers of the lower and the upper ends on the central path, v = rho / slack."""
+        lower, upper = box.sides(trajectory)
+        return (
+            jax.tree.map(lambda z, a: weight * _inverse(self._slack(z - a), a), trajectory, lower),
+            jax.tree.map(lambda z, b: weight * _inverse(self._slack(b - z), b), trajectory, upper),
+        )
+
+    def follow(
+        self,
+        box: Box,
+        old: Trajectory,
+        new: Trajectory,
+        multipliers: Sides,
+        weight: ArrayLike,
+        size: ArrayLike,
+    ) -> Sides:
+        """Multipliers after a step from `old` to `new` of relative size alpha.
+
+        Newton's step for v slack = rho is dv = rho / slack - v - v / slack dslack. v is then held
+        within a factor of `FOLLOW` of the central path, so that neither it nor the curvature can
+        run away from what the slacks say.
+        """
+
+        def side(z: Array, z_new: Array, end: Array, v: Array, sign: float) -> Array:
+            slack, after = (self._slack(sign * (a - end)) for a in (z, z_new))
+            step = size * (weight / slack - v) - v / slack * sign * (z_new - z)
+            central = weight / after
+            held = jnp.clip(v + step, central / FOLLOW, central * FOLLOW)
+            return jnp.where(jnp.isinf(end), 0.0, held)
+
+        lower, upper = box.sides(old)
+        return (
+            jax.tree.map(partial(side, sign=1.0), old, new, lower, multipliers[0]),
+            jax.tree.map(partial(side, sign=-1.0), old, new, upper, multipliers[1]),
         )
 
     def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
@@ -111,9 +164,27 @@ class _WithoutBarrier:
         """b of the slack variables as one term per knot, (K,)."""
         return LogBarrier().value(_free(box), trajectory)
 
-    def derivatives(self, box: Box, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
-        """Gradient and diagonal of the Hessian of b: zeros but for the slack variables."""
-        return LogBarrier().derivatives(_free(box), trajectory)
+    def derivatives(
+        self, box: Box, trajectory: Trajectory, weight: ArrayLike, multipliers: Sides | None = None
+    ) -> tuple[Trajectory, Trajectory]:
+        """Gradient and curvature of rho b: zeros but for the slack variables."""
+        return LogBarrier().derivatives(_free(box), trajectory, weight, multipliers)
+
+    def multipliers(self, box: Box, trajectory: Trajectory, weight: ArrayLike) -> Sides:
+        """Multipliers of the slack variables' bounds; zeros for all others."""
+        return LogBarrier().multipliers(_free(box), trajectory, weight)
+
+    def follow(
+        self,
+        box: Box,
+        old: Trajectory,
+        new: Trajectory,
+        multipliers: Sides,
+        weight: ArrayLike,
+        size: ArrayLike,
+    ) -> Sides:
+        """`LogBarrier.follow` for the slack variables."""
+        return LogBarrier().follow(_free(box), old, new, multipliers, weight, size)
 
     def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
         """The nearest trajectory inside the box, ends included."""

@@ -7,7 +7,6 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 
     from mjx_drax.langevin import Info, Langevin
     from mjx_drax.problem import Problem
+    from mjx_drax.restarts import Restarts
     from mjx_drax.solution import Solution
 
 COST_FILE = """\
@@ -33,7 +33,7 @@ on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
   x_bounds, u_bounds       (lower, upper)
   x_scatter, u_scatter     (lower, upper): where initial knots are drawn
   guess(key) -> Trajectory initial knots of one chain
-  solver                   a mjx_drax.Langevin
+  solver                   a mjx_drax.Restarts or mjx_drax.Langevin
 """
 _PROBLEM_NAMES = (
     "running_cost",
@@ -54,6 +54,9 @@ _PROBLEM_NAMES = (
     "u_scatter",
     "guess",
 )
+
+if TYPE_CHECKING:
+    Asked = tuple[Problem, Langevin | Restarts, int, Callable[..., Any] | None]
 
 OPTIMA = 5
 """So many distinct optima are printed."""
@@ -97,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         "--iterations",
         type=_positive,
         metavar="K",
-        help="iterations with noise; the noise-free tail keeps its share",
+        help="iterations with noise of an attempt; those without keep their share",
     )
     solving.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
     solving.add_argument("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
@@ -164,11 +167,11 @@ def _solve(options: argparse.Namespace) -> int:
         _own_problem(options) if options.task is None else _task(options)
     )
     from mjx_drax import results
+    from mjx_drax.restarts import with_iterations
     from mjx_drax.solution import solve
 
     if options.iterations is not None:
-        share = options.iterations / max(solver.iterations, 1)
-        solver = replace(solver, iterations=options.iterations, tail=round(share * solver.tail))
+        solver = with_iterations(solver, options.iterations)
     folder = results.writable(options.out or Path("out") / problem.name)
     _cache_compilations()
 
@@ -226,9 +229,9 @@ def _reproduce(options: argparse.Namespace) -> int:
     return 0
 
 
-def _task(options: argparse.Namespace) -> tuple[Problem, Langevin, int, Callable[..., Any] | None]:
+def _task(options: argparse.Namespace) -> Asked:
     """Problem, settings, number of chains and drawing function of a named task."""
-    from mjx_drax import Langevin, tasks
+    from mjx_drax import Restarts, tasks
 
     if options.model or options.cost:
         raise DraxError(
@@ -236,17 +239,16 @@ def _task(options: argparse.Namespace) -> tuple[Problem, Langevin, int, Callable
         )
     task = tasks.load(options.task)
     problem = task.make() if options.horizon is None else task.make(horizon=options.horizon)
-    solver = getattr(task, "SOLVER", None) or Langevin()
-    return problem, solver, getattr(task, "CHAINS", 64), getattr(task, "draw", None)
+    return problem, Restarts(), getattr(task, "CHAINS", 64), getattr(task, "draw", None)
 
 
 def _own_problem(
     options: argparse.Namespace,
-) -> tuple[Problem, Langevin, int, Callable[..., Any] | None]:
+) -> Asked:
     """The same for the user's own model and cost file."""
     if not (options.model and options.cost):
         raise DraxError("give a task (see `mjx-drax list`), or both --model XML and --cost PY.")
-    from mjx_drax import Langevin, from_mjcf
+    from mjx_drax import Langevin, Restarts, from_mjcf
 
     module = _load_cost_file(Path(options.cost))
     given = {n: getattr(module, n) for n in _PROBLEM_NAMES if hasattr(module, n)}
@@ -255,9 +257,9 @@ def _own_problem(
     if "horizon" not in given:
         raise DraxError(f"no horizon: define it in {options.cost} or give --horizon SECONDS.")
     problem = from_mjcf(options.model, name=Path(options.model).stem, **given)
-    solver = getattr(module, "solver", None) or Langevin()
-    if not isinstance(solver, Langevin):
-        raise DraxError(f"solver in {options.cost} is {solver!r}: it must be a mjx_drax.Langevin.")
+    solver = getattr(module, "solver", None) or Restarts()
+    if not isinstance(solver, Langevin | Restarts):
+        raise DraxError(f"solver in {options.cost} is {solver!r}: give a mjx_drax.Restarts.")
     return problem, solver, 64, None
 
 

@@ -8,7 +8,9 @@ One iteration of a chain (Kurtz and Burdick, with the metric M of `precondition`
 While sigma > 0 knots leave the dynamics and wander between basins; the multipliers pull them back
 onto h = 0 as sigma falls. The noise-free tail then takes the step size that lowers the augmented
 Lagrangian most, from a short geometric ladder evaluated in one batch: with Gauss-Newton that is
-sequential quadratic programming, and it is what brings max|h| to rounding level.
+sequential quadratic programming, and it is what brings max|h| to rounding level. In the tail each
+chain adapts its damping as Levenberg and Marquardt do, less after a full step and more after a
+short one, and bounds get multipliers of their own (`bounds`).
 
 `init`, `step` and `advance` work on all chains at once. Chains never exchange numbers: a chain
 that turns non-finite is frozen where it last was finite and marked as diverged.
@@ -27,7 +29,7 @@ from jax import Array
 from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
-from mjx_drax.bounds import LogBarrier
+from mjx_drax.bounds import LogBarrier, Sides
 from mjx_drax.dynamics import Static
 from mjx_drax.errors import DraxError
 from mjx_drax.precondition import (
@@ -47,8 +49,11 @@ from mjx_drax.schedules import Constant, Geometric
 FEASIBLE = 1e-3
 """Largest defect max|h| that counts as feasible."""
 
-LADDER = (*(0.5**i for i in range(9)), 0.0)
-"""Step sizes that the tail chooses from."""
+EASE, TIGHTEN, SHORT = 1 / 3, 4.0, 0.2
+"""Factors of a chain's damping after a full step, and after one shorter than `SHORT`."""
+
+DAMPING = 1e-3, 1e3
+"""Range of a chain's factor on the damping."""
 
 SLACK = 1e-2
 """Smallest slack that an inequality starts with."""
@@ -61,7 +66,8 @@ class State:
 
     Attributes:
         trajectory: knots, (chains, K, nx) and (chains, K, nu).
-        multipliers: lambda, of dynamics (chains, K, ndx) and constraints.
+        multipliers: lambda, of dynamics (chains, K, ndx) and constraints, and those of bounds.
+        damping: factor on delta that the tail adapts, (chains,).
         gains: time-varying LQR feedback of the last factorization, (chains, K, nu, ndx).
         memory: what the metric carries from one iteration to the next; () for most.
         key: random key of each chain, (chains,).
@@ -71,6 +77,7 @@ class State:
 
     trajectory: Trajectory
     multipliers: Multipliers
+    damping: Array
     gains: Array
     memory: Any
     key: Array
@@ -93,6 +100,20 @@ class Info:
 
 @register_dataclass
 @dataclass(frozen=True)
+class Scale:
+    """Units that the schedules are multiples of.
+
+    Attributes:
+        cost: of mu, delta and rho, which all are costs.
+        noise: of sigma, the square root of a cost: sigma^2 is a temperature.
+    """
+
+    cost: ArrayLike = 1.0
+    noise: ArrayLike = 1.0
+
+
+@register_dataclass
+@dataclass(frozen=True)
 class Langevin:
     """The solver: its settings, which are traced, and its interchangeable parts.
 
@@ -104,6 +125,7 @@ class Langevin:
         penalty: schedule of mu.
         damping: schedule of delta, added to the diagonal of the cost's Hessian.
         barrier_weight: schedule of rho.
+        scale: units of the four schedules; `Restarts` measures them.
         preconditioner: the metric M.
         bounds: how bounds are kept.
         adjusted: Metropolis-adjusted noisy steps (static; with `Identity` only): a chain without
@@ -117,9 +139,15 @@ class Langevin:
     penalty: Geometric | Constant = Geometric(100.0, 1000.0, 1e4)
     damping: Geometric | Constant = Geometric(0.1, 0.1, 0.03)
     barrier_weight: Geometric | Constant = Geometric(0.1, 0.01, 1e-4)
+    scale: Scale = field(default_factory=Scale)
     preconditioner: GaussNewton | Diagonal | Identity | LBFGS = field(default_factory=GaussNewton)
     bounds: Bounds = field(default_factory=LogBarrier)
     adjusted: bool = field(default=False, metadata=Static)
+
+    @property
+    def noise_ends(self) -> list[int]:
+        """After how many iterations the noise ends."""
+        return [int(self.iterations)]
 
     def check(self, problem: Problem) -> None:
         """Complain about settings that cannot work.
@@ -155,7 +183,13 @@ class Langevin:
     def levels(self, t: ArrayLike) -> Levels:
         """The schedules' values at progress t in [0, 2]."""
         t = jnp.asarray(t)
-        return Levels(self.noise(t), self.penalty(t), self.damping(t), self.barrier_weight(t))
+        cost, noise = jnp.asarray(self.scale.cost), jnp.asarray(self.scale.noise)
+        return Levels(
+            noise * self.noise(t),
+            cost * self.penalty(t),
+            cost * self.damping(t),
+            cost * self.barrier_weight(t),
+        )
 
     def init(self, problem: Problem, trajectory: Trajectory, key: Array) -> State:
         """The first state of a batch of chains that start at the given knots.
@@ -179,7 +213,9 @@ class Langevin:
             multipliers=Multipliers(
                 jnp.zeros((chains, K, ndx)),
                 Stagewise(jnp.zeros((chains, K, m)), jnp.zeros((chains, m_end))),
+                self._central(problem, inside, self.levels(0.0)),
             ),
+            damping=jnp.ones(chains),
             gains=jnp.zeros((chains, K, nu, ndx)),
             memory=jax.vmap(self.preconditioner.memory, in_axes=(None, 0))(problem, inside),
             key=jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains)),
@@ -205,20 +241,24 @@ class Langevin:
         levels = self.levels(t)
 
         def direction(
-            trajectory: Trajectory, multipliers: Multipliers, key: Array, memory: Any
+            trajectory: Trajectory,
+            multipliers: Multipliers,
+            damping: Array,
+            key: Array,
+            memory: Any,
         ) -> Direction:
             return self.preconditioner.direction(
                 problem,
                 self.bounds,
                 trajectory,
                 multipliers,
-                levels,
+                replace(levels, damping=damping * levels.damping),
                 jax.random.fold_in(key, iteration),
                 memory,
             )
 
         directions = jax.vmap(direction)(
-            state.trajectory, state.multipliers, state.key, state.memory
+            state.trajectory, state.multipliers, state.damping, state.key, state.memory
         )
 
         def diffuse(state: State) -> tuple[Trajectory, Array]:
@@ -232,7 +272,7 @@ class Langevin:
                 if not self.adjusted:
                     return self._moved(problem, old, change)
                 new = jax.tree.map(jnp.add, old, change)
-                back = direction(new, multipliers, key, ()).drift
+                back = direction(new, multipliers, jnp.ones(()), key, ()).drift
                 ratio = self._log_acceptance(problem, old, new, multipliers, to.drift, back, levels)
                 u = jax.random.uniform(jax.random.fold_in(jax.random.fold_in(key, iteration), 1))
                 inside = problem.bounds.violation(new) == 0.0
@@ -259,7 +299,7 @@ class Langevin:
                     gain = jnp.where(size > 0.0, gain, worst)
                     return jnp.where(jnp.isfinite(gain), gain, jnp.inf), new
 
-                sizes = jnp.asarray(LADDER, old.x.dtype)
+                sizes = jnp.asarray(self.preconditioner.ladder, old.x.dtype)
                 gains, candidates = jax.vmap(attempt)(sizes)
                 best = jnp.argmin(gains)
                 return jax.tree.map(lambda z: z[best], candidates), sizes[best]
@@ -270,21 +310,36 @@ class Langevin:
             trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
         else:
             trajectory, size = diffuse(state)
+        factor = jnp.where(size >= 1.0, EASE, jnp.where(size < SHORT, TIGHTEN, 1.0))
+        adapted = jnp.clip(factor * state.damping, *DAMPING)
         if self.preconditioner.multipliers_step_alone:
             size = jnp.ones_like(size)
         multipliers = jax.tree.map(
             lambda m, rate: m + _per_chain(size, m) * rate,
-            state.multipliers,
+            replace(state.multipliers, bounds=None),
             directions.multipliers,
+        )
+        follow = jax.vmap(self.bounds.follow, in_axes=(None, 0, 0, 0, None, 0))
+        old: Trajectory = state.trajectory
+        of_bounds: Any = state.multipliers.bounds
+        followed = follow(problem.bounds, old, trajectory, of_bounds, levels.barrier, size)
+        of_bounds = jax.tree.map(
+            partial(jnp.where, noisy), self._central(problem, trajectory, levels), followed
         )
         new = replace(
             state,
             trajectory=trajectory,
-            multipliers=multipliers,
+            multipliers=replace(multipliers, bounds=of_bounds),
+            damping=jnp.where(noisy, state.damping, adapted),
             gains=directions.gains,
             memory=directions.memory,
         )
         return _keep_finite(state, new, iteration)
+
+    def _central(self, problem: Problem, trajectory: Trajectory, levels: Levels) -> Sides:
+        """The bounds' multipliers of every chain, on the central path."""
+        multipliers = jax.vmap(self.bounds.multipliers, in_axes=(None, 0, None))
+        return multipliers(problem.bounds, trajectory, levels.barrier)
 
     def _log_acceptance(
         self,
@@ -339,22 +394,15 @@ def _per_chain(values: Array, like: Array) -> Array:
 
 def _keep_finite(old: State, new: State, iteration: Array) -> State:
     """The new state, where chains that would turn non-finite stay what they were."""
-
-    def numbers(state: State) -> tuple[Trajectory, Multipliers, Array, Any]:
-        return state.trajectory, state.multipliers, state.gains, state.memory
-
+    names = ("trajectory", "multipliers", "damping", "gains", "memory")
+    before, after = ({name: getattr(state, name) for name in names} for state in (old, new))
     finite = jnp.stack(
-        [
-            jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim)))
-            for a in jax.tree.leaves(numbers(new))
-        ]
+        [jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim))) for a in jax.tree.leaves(after)]
     ).all(0)
     alive = old.alive & finite
-    trajectory, multipliers, gains, memory = jax.tree.map(
-        lambda a, b: jnp.where(_per_chain(alive, a), a, b), numbers(new), numbers(old)
-    )
+    kept = jax.tree.map(lambda a, b: jnp.where(_per_chain(alive, a), a, b), after, before)
     died_at = jnp.where(old.alive & ~finite, iteration, old.died_at)
-    return State(trajectory, multipliers, gains, memory, old.key, alive, died_at)
+    return replace(new, alive=alive, died_at=died_at, **kept)
 
 
 @jax.jit

@@ -39,11 +39,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.langevin import FEASIBLE, LADDER, Info, Langevin, evaluate
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, evaluate
 from mjx_drax.peers import shooting
 from mjx_drax.problem import Problem, Trajectory
 from mjx_drax.reproduce import many
-from mjx_drax.solution import Solution, solve
+from mjx_drax.restarts import Restarts
+from mjx_drax.solution import OUTSIDE, Solution, solve
 
 if TYPE_CHECKING:
     from mjx_drax.peers.ipopt import Transcription
@@ -76,7 +77,7 @@ FIELDS = (
 """What every row holds; None where a method has no such number."""
 
 OURS = "mjx_drax"
-"""What `solver` says for this library with a task's own settings."""
+"""What `solver` says for this library with its default settings."""
 
 BEST_KNOWN = {
     "pendulum": 0.031774,
@@ -94,9 +95,6 @@ NEAR = 2.0
 
 PROBES = 8
 """Largest number of interrupted solves for one row."""
-
-OUTSIDE = 1e-2
-"""How far a replay may leave the bounds of the states."""
 
 STARTS = 20
 """Largest number of IPOPT's starts for one row."""
@@ -158,7 +156,7 @@ def over_time(seconds: Sequence[float], share: Sequence[float], close: Sequence[
 
 def ours(
     problem: Problem,
-    solver: Langevin,
+    solver: Langevin | Restarts,
     chains: int,
     seed: int,
     name: str = OURS,
@@ -180,7 +178,7 @@ def ours(
         certified=solution.certified,
         best_cost=float(solution.cost[best]),
         max_defect=float(solution.max_defect[best]),
-        evaluations=evaluations(solver, problem, chains),
+        evaluations=evaluations(solver, problem, chains, solution.iterations),
         open_loop_deviation=certificate.open_loop["max_deviation"],
         feedback_deviation=certificate.feedback["max_deviation"],
         median_success_cost=float(np.median(solution.cost[solution.success]))
@@ -192,16 +190,19 @@ def ours(
     )
 
 
-def evaluations(solver: Langevin, problem: Problem, chains: int) -> int:
-    """Evaluations of f that a solve costs.
+def evaluations(solver: Langevin | Restarts, problem: Problem, chains: int, iterations: int) -> int:
+    """Evaluations of f that so many iterations cost.
 
     Per knot, an iteration linearizes, 1 + ndx + nu evaluations (forward mode, or one reverse sweep
     for less), and one of the tail also tries every step size of its ladder.
     """
     dynamics = problem.dynamics
     linearization = 1 + dynamics.ndx + dynamics.nu
-    total, tail = int(solver.iterations) + int(solver.tail), int(solver.tail)
-    return chains * problem.horizon * (total * linearization + tail * len(LADDER))
+    flow = solver.flow if isinstance(solver, Restarts) else solver
+    each = int(flow.iterations) + int(flow.tail)
+    attempts = -(-iterations // each) if isinstance(solver, Restarts) else 1
+    searches = attempts * int(flow.tail) * len(flow.preconditioner.ladder)
+    return chains * problem.horizon * (iterations * linearization + searches)
 
 
 def _interrupted(solution: Solution, probes: int) -> list[tuple[float, float, float]]:
@@ -424,7 +425,7 @@ def random_states(
         "certified": bool(np.any(success & (defect < FEASIBLE))),
         "best_cost": float(np.median(cost)),
         "max_defect": float(np.median(defect)),
-        "evaluations": evaluations(solver, problem, count),
+        "evaluations": evaluations(solver, problem, count, total),
         "compile_time_s": compile_time,
         "solve_time_s": seconds,
         **found,

@@ -335,10 +335,12 @@ def _draw_history(
     band.set_label("smallest to largest")
     handles: list[Artist] = [*axes.plot(iterations, median, ".-", ms=3, lw=1.6, color=color)]
     handles[0].set_label("median")
-    if 0 < int(solution.solver.iterations) <= iterations[-1]:
-        end = axes.axvline(int(solution.solver.iterations), ls="--", lw=1, color=GRAY)
-        end.set_label("noise ends")
-        handles.append(end)
+    marks = [mark for mark in solution.solver.noise_ends if 0 < mark <= iterations[-1]]
+    for mark in marks:
+        line = axes.axvline(mark, ls="--", lw=1, color=GRAY)
+    if marks:
+        line.set_label("noise ends")
+        handles.append(line)
     axes.set_xlim(0, max(1, iterations[-1]))
     return [*handles, band]
 

@@ -11,7 +11,7 @@ dropped.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import register_dataclass
 
-from mjx_drax.bounds import LogBarrier, Projection, Reflection
+from mjx_drax.bounds import LogBarrier, Projection, Reflection, Sides
 from mjx_drax.constraints import Eliminated, eliminate, recover
 from mjx_drax.derivatives import Autodiff, Differentiator
 from mjx_drax.linearize import Linearization, linearize
@@ -43,10 +43,11 @@ class Levels:
 @register_dataclass
 @dataclass(frozen=True)
 class Multipliers:
-    """lambda, of the dynamics (K, ndx) and of the constraints."""
+    """lambda of the dynamics (K, ndx) and of the constraints; v of the bounds, where followed."""
 
     dynamics: Array
     constraints: Stagewise
+    bounds: Sides | None = None
 
 
 @register_dataclass
@@ -57,7 +58,7 @@ class Direction:
     Attributes:
         drift: d.
         noise: n, for sigma = 1.
-        multipliers: their rate r.
+        multipliers: their rate r, without that of the bounds.
         gains: feedback that comes with the metric, (K, nu, ndx); zeros if none does.
         memory: what the metric wants to see again in the next iteration.
     """
@@ -70,9 +71,13 @@ class Direction:
 
 
 class Memoryless:
-    """A metric that is made anew in every iteration, and whose multipliers step with its knots."""
+    """A metric that is made anew in every iteration, and whose multipliers step with its knots.
+
+    `ladder` holds the step sizes that the tail chooses from: all halvings down to 1/256.
+    """
 
     multipliers_step_alone = False
+    ladder: tuple[float, ...] = (*(0.5**i for i in range(9)), 0.0)
 
     def memory(self, problem: Problem, trajectory: Trajectory) -> tuple[()]:
         """Nothing."""
@@ -153,8 +158,8 @@ class Identity(Memoryless):
         else:
             model = expand(problem, trajectory, self.derivatives, key_samples)
             slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
-        walls, _ = bounds.derivatives(problem.bounds, trajectory)
-        drift = jax.tree.map(lambda g, b: -(g + levels.barrier * b), slope, walls)
+        walls, _ = bounds.derivatives(problem.bounds, trajectory, levels.barrier)
+        drift = jax.tree.map(lambda g, b: -(g + b), slope, walls)
         h = Multipliers(*residuals(problem, trajectory))
         rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, h)
         return Direction(drift, _white(trajectory, key_noise), rate, _no_gains(problem))
@@ -239,7 +244,8 @@ def _assembled_gradient(
     """The gradient of c + lambda'h + mu/2 |h|^2, put together from the derivatives of a model."""
     ndx = model.dynamics.h.shape[-1]
     h = Multipliers(model.dynamics.h, model.residual)
-    force = jax.tree.map(lambda m, r: m + penalty * r, multipliers, h)  # lambda + mu h
+    present = replace(multipliers, bounds=None)
+    force = jax.tree.map(lambda m, r: m + penalty * r, present, h)  # lambda + mu h
     stage = jnp.einsum("kij,ki->kj", model.stage, force.constraints.stage)
     gx = model.cost.gx.at[:-1].add(stage[:, :ndx])
     gx = gx.at[-1].add(model.terminal.T @ force.constraints.terminal)
@@ -281,13 +287,15 @@ class Diagonal(Memoryless):
         key_noise, key_model = jax.random.split(key)
         model = expand(problem, trajectory, self.derivatives, key_model)
         slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
-        walls, curvature = bounds.derivatives(problem.bounds, trajectory)
+        walls, curvature = bounds.derivatives(
+            problem.bounds, trajectory, levels.barrier, multipliers.bounds
+        )
         M = jax.tree.map(
-            lambda m, c: m + levels.barrier * c + levels.damping,
+            lambda m, c: m + c + levels.damping,
             _diagonal(model, trajectory, levels.penalty),
             curvature,
         )
-        drift = jax.tree.map(lambda g, b, m: -(g + levels.barrier * b) / m, slope, walls, M)
+        drift = jax.tree.map(lambda g, b, m: -(g + b) / m, slope, walls, M)
         noise = jax.tree.map(lambda xi, m: xi / jnp.sqrt(m), _white(trajectory, key_noise), M)
         h = Multipliers(model.dynamics.h, model.residual)
         rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, h)
@@ -314,8 +322,12 @@ class GaussNewton(Memoryless):
     """M = H + mu J'J + delta I, with H the Gauss-Newton model of c plus the barrier's diagonal.
 
     The multipliers follow the predicted, noise-free residual: r = mu (h + J d).
+
+    The ladder is short, because damping adapts: with ten sizes no more chains succeed, and the tail
+    takes longer.
     """
 
+    ladder = (1.0, 1 / 2, 1 / 4, 1 / 16, 0.0)
     derivatives: Differentiator = field(default_factory=Autodiff)
 
     def direction(
@@ -331,15 +343,14 @@ class GaussNewton(Memoryless):
         """Drift, noise and multiplier rate, from one block-tridiagonal factorization."""
         key_model, key_noise, key_slack = jax.random.split(key, 3)
         model = expand(problem, trajectory, self.derivatives, key_model)
-        cost = _with_barrier(model.cost, problem, bounds, trajectory, levels)
+        walls = bounds.derivatives(problem.bounds, trajectory, levels.barrier, multipliers.bounds)
+        cost = _with_barrier(model.cost, *walls, levels.damping)
         slope, curvature = (
-            d.slack or Stagewise(jnp.zeros((problem.horizon, 0)), jnp.zeros(0))
-            for d in bounds.derivatives(problem.bounds, trajectory)
+            d.slack or Stagewise(jnp.zeros((problem.horizon, 0)), jnp.zeros(0)) for d in walls
         )
 
         def reduce(J: Array, r: Array, nu: Array, b: Array, c: Array) -> Any:
-            damped = levels.barrier * c + levels.damping
-            return eliminate(J, r, nu, levels.barrier * b, damped, levels.penalty)
+            return eliminate(J, r, nu, b, c + levels.damping, levels.penalty)
 
         r, nu = model.residual, multipliers.constraints
         g, H, blocks = jax.vmap(reduce)(
@@ -390,15 +401,14 @@ def _stage_steps(dx: Array, du: Array) -> Array:
 
 
 def _with_barrier(
-    cost: QuadraticCost, problem: Problem, bounds: Bounds, trajectory: Trajectory, levels: Levels
+    cost: QuadraticCost, slope: Trajectory, curvature: Trajectory, damping: Array
 ) -> QuadraticCost:
     """The model of c + rho b + delta/2 |dz|^2; there is no barrier on x_0, which is fixed."""
-    slope, curvature = bounds.derivatives(problem.bounds, trajectory)
-    diagonal_x = jnp.full_like(cost.gx, levels.damping).at[1:].add(levels.barrier * curvature.x)
-    diagonal_u = levels.damping + levels.barrier * curvature.u
+    diagonal_x = jnp.full_like(cost.gx, damping).at[1:].add(curvature.x)
+    diagonal_u = damping + curvature.u
     return QuadraticCost(
-        cost.gx.at[1:].add(levels.barrier * slope.x),
-        cost.gu + levels.barrier * slope.u,
+        cost.gx.at[1:].add(slope.x),
+        cost.gu + slope.u,
         cost.Hxx + jax.vmap(jnp.diag)(diagonal_x),
         cost.Hux,
         cost.Huu + jax.vmap(jnp.diag)(diagonal_u),

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Langevin
 from mjx_drax.problem import Problem, Trajectory, from_function
-from mjx_drax.solution import Progress, run
+from mjx_drax.restarts import Progress, Restarts, run
 
 
 def from_program(
@@ -108,7 +108,7 @@ def minimize(
     program: Problem,
     chains: int = 64,
     seed: int = 0,
-    solver: Langevin | None = None,
+    solver: Langevin | Restarts | None = None,
     guess: ArrayLike | None = None,
     progress: Progress | None = None,
 ) -> Minimum:
@@ -130,8 +130,8 @@ def minimize(
             )
         u = jnp.asarray(given)[..., None, :]
         knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
-    result = run(program, chains, seed, solver or Langevin(), knots, progress)
-    info, rows = result.records[-1][1], program.constraint.equalities
+    result = run(program, chains, seed, solver or Restarts(), knots, progress)
+    info, rows = result.info, program.constraint.equalities
     multipliers = np.asarray(result.state.multipliers.constraints.stage[:, 0])
     return Minimum(
         x=np.asarray(result.state.trajectory.u[:, 0]),

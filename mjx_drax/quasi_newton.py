@@ -51,7 +51,8 @@ class LBFGS:
         inner: steps between two updates of the multipliers.
     """
 
-    multipliers_step_alone = True  # the line search's step size is for the knots only
+    multipliers_step_alone = True
+    ladder = Identity.ladder  # the line search's step size is for the knots only
 
     pairs: int = field(default=10, metadata=Static)
     inner: int = field(default=20, metadata=Static)

@@ -7,13 +7,12 @@ for MJCF, a float64 rollout for functions), open loop and with the feedback
     u_k + K_k (x_k - x_k^plan),   clipped to the control bounds,
 
 where K is the time-varying LQR that the solver's factorization yields. Success means that the
-replay reaches the goal; without a goal, that it ends within `TRACKED` of the plan.
+replay reaches the goal, and leaves the bounds by `OUTSIDE` at most; without a goal, that it ends
+within `TRACKED` of the plan.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,20 +20,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import (
-    FEASIBLE,
-    Info,
-    Langevin,
-    State,
-    advance,
-    evaluate,
-    feedback_gains,
-)
+from mjx_drax.langevin import FEASIBLE, Langevin, evaluate, feedback_gains
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
+from mjx_drax.restarts import Progress, Restarts, Run, run
 
 if TYPE_CHECKING:
     from mjx_drax.optima import Optimum
@@ -42,14 +33,11 @@ if TYPE_CHECKING:
 TRACKED = 1e-2
 """Largest final deviation |x - plan| of a successful replay, where the problem has no goal."""
 
-CHUNK = 10
-"""Iterations between two reports, records of the history, and chances to interrupt; a hundredth
-of all where that is more."""
+OUTSIDE = 1e-2
+"""How far a replay that succeeds may leave the bounds of the states."""
 
 OPEN_LOOP, WITH_FEEDBACK = "open loop", "with feedback"
 CONVERGED, INFEASIBLE, DIVERGED = "converged", "infeasible", "diverged"
-
-Progress = Callable[[int, int, Info], None]
 
 
 @dataclass(frozen=True)
@@ -57,13 +45,14 @@ class Replays:
     """What the engine did with every chain's controls.
 
     states (chains, K+1, nx), controls (chains, K, nu), largest deviation from the plan over the
-    whole motion and at its end, cost, and whether it succeeded, (chains,) each.
+    whole motion and at its end, bound violation, cost, and whether it succeeded, (chains,) each.
     """
 
     states: np.ndarray
     controls: np.ndarray
     max_deviation: np.ndarray
     final_deviation: np.ndarray
+    max_violation: np.ndarray
     cost: np.ndarray
     success: np.ndarray
 
@@ -72,6 +61,7 @@ class Replays:
         return {
             "max_deviation": float(self.max_deviation[chain]),
             "final_deviation": float(self.final_deviation[chain]),
+            "max_violation": float(self.max_violation[chain]),
             "cost": float(self.cost[chain]),
             "success": bool(self.success[chain]),
         }
@@ -100,19 +90,20 @@ class Solution:
         solver: with which settings.
         seed: of the random keys.
         trajectories: knots, (chains, K, nx) and (chains, K, nu), and slacks of inequalities.
-        multipliers: lambda, of dynamics (chains, K, ndx) and constraints.
+        multipliers: lambda, of dynamics (chains, K, ndx) and constraints, and those of bounds.
         gains: feedback K_k, (chains, K, nu, ndx).
         cost, max_defect, max_violation: of every chain, (chains,).
         converged_at: iteration since which max|h| < 1e-3, else -1, (chains,).
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
         open_loop, feedback: the replays of every chain.
-        history: `iteration` (records,), and `cost`, `max_defect` (records, chains).
+        history: `iteration` (records,), and `cost`, `max_defect` (records, chains) of every place
+            in the batch, which in later attempts of `Restarts` hold tries for unfinished chains.
         iterations: how many were done.
         compile_time, solve_time: [s].
     """
 
     problem: Problem
-    solver: Langevin
+    solver: Langevin | Restarts
     seed: int
     trajectories: Trajectory
     multipliers: Multipliers
@@ -200,6 +191,8 @@ class Solution:
         replay = certificate.open_loop if mode == OPEN_LOOP else certificate.feedback
         if not np.isfinite(replay["max_deviation"]):
             return "diverges"
+        if replay["max_violation"] >= OUTSIDE:
+            return f"leaves the bounds by {replay['max_violation']:.1e}"
         words = ("misses the goal", "reaches the goal")
         if self.problem.goal is None:
             words = ("leaves the plan", "keeps to the plan")
@@ -216,7 +209,7 @@ def solve(
     problem: Problem,
     chains: int = 64,
     seed: int = 0,
-    solver: Langevin | None = None,
+    solver: Langevin | Restarts | None = None,
     guess: Trajectory | None = None,
     progress: Progress | None = None,
 ) -> Solution:
@@ -226,7 +219,8 @@ def solve(
         problem: from `from_mjcf` or `from_function`.
         chains: number of chains.
         seed: of all random numbers.
-        solver: settings; `Langevin()` by default.
+        solver: `Restarts()` by default, whose settings are scaled from the problem; or one
+            `Langevin` with its schedules as they stand.
         guess: initial knots instead of random ones: one trajectory for all chains, (K, nx) and
             (K, nu), or one each, (chains, K, nx) and (chains, K, nu). They need not be feasible.
         progress: called with (iterations done, of how many, diagnostics) every few iterations;
@@ -241,107 +235,19 @@ def solve(
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
-    solver = solver or Langevin()
+    solver = solver or Restarts()
     return _certified(problem, solver, seed, run(problem, chains, seed, solver, guess, progress))
 
 
-@dataclass(frozen=True)
-class Run:
-    """Where the chains of a solve ended, before any replay."""
-
-    state: State
-    records: list[tuple[int, Info]]
-    converged_at: np.ndarray
-    compile_time: float
-    solve_time: float
-
-
-def run(
-    problem: Problem,
-    chains: int,
-    seed: int,
-    solver: Langevin,
-    guess: Trajectory | None = None,
-    progress: Progress | None = None,
-) -> Run:
-    """The iterations of `solve`, for problems that need no replay; the same arguments."""
-    if not isinstance(chains, int | np.integer) or chains < 1:
-        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
-    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
-        raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
-    solver.check(problem)
-    total = solver.iterations + solver.tail
-    key_knots, key_noise = jax.random.split(jax.random.key(seed))
-    state = solver.init(problem, _initial_knots(problem, chains, guess, key_knots), key_noise)
-
-    clock = time.perf_counter()
-    info = jax.block_until_ready(evaluate(problem, state.trajectory))
-    _require_finite(problem, info)
-    tail = int(solver.tail) > 0
-    jax.block_until_ready(advance(solver, problem, state, 0, 0, tail))
-    compile_time = time.perf_counter() - clock
-
-    clock = time.perf_counter()
-    records = [(0, info)]
-    done, converged_at = 0, np.full(chains, -1)
-    try:
-        while done < total:
-            stop = min(done + max(CHUNK, total // 100), total)
-            ahead = advance(solver, problem, state, done, stop, tail)
-            info = jax.block_until_ready(evaluate(problem, ahead.trajectory))
-            state, done = ahead, stop  # together, so that Ctrl-C never parts them
-            records.append((done, info))
-            feasible = np.asarray(info.max_defect) < FEASIBLE
-            converged_at = np.where(feasible & (converged_at < 0), done, converged_at)
-            converged_at = np.where(feasible, converged_at, -1)
-            if progress is not None:
-                progress(done, total, info)
-    except KeyboardInterrupt:
-        pass  # the chains as they were at the last report
-    return Run(state, records, converged_at, compile_time, time.perf_counter() - clock)
-
-
-def _initial_knots(
-    problem: Problem, chains: int, guess: Trajectory | None, key: Array
-) -> Trajectory:
-    """Initial knots for every chain: drawn, or the guess broadcast to all of them."""
-    if guess is None:
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
-        return jax.vmap(problem.draw)(keys)
-    K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
-    knots = []
-    for label, value, size in (("x", guess.x, nx), ("u", guess.u, nu)):
-        array = np.asarray(value, problem.x_init.dtype)
-        if array.shape not in ((K, size), (chains, K, size)):
-            raise DraxError(
-                f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
-                f"({chains}, {K}, {size}) with one for each chain."
-            )
-        if not np.isfinite(array).all():
-            raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
-        knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
-    return Trajectory(knots[0], knots[1])
-
-
-def _require_finite(problem: Problem, info: Info) -> None:
-    """Complain if no chain could possibly start."""
-    for label, values in (("cost", info.cost), ("dynamics", info.max_defect)):
-        if not np.isfinite(values).any():
-            raise DraxError(
-                f"the {label} of {problem.name} is {float(values[0])} at the initial knots of "
-                f"every chain ({len(values)} tried): make it finite there (no 0/0, no log or sqrt "
-                "of negative numbers), or narrow the scatter of the initial knots."
-            )
-
-
-def _certified(problem: Problem, solver: Langevin, seed: int, run: Run) -> Solution:
+def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Run) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
     state, records = run.state, run.records
     trajectories = jax.tree.map(np.asarray, state.trajectory)
     gains = np.asarray(state.gains)
-    if not isinstance(solver.preconditioner, GaussNewton):  # the others bring no gains
-        gains = np.asarray(feedback_gains(solver, problem, state))
-    info = records[-1][1]
+    flow = solver.flow if isinstance(solver, Restarts) else solver
+    if not isinstance(flow.preconditioner, GaussNewton):  # the others bring no gains
+        gains = np.asarray(feedback_gains(flow, problem, state))
+    info = run.info
     return Solution(
         problem=problem,
         solver=solver,
@@ -381,15 +287,17 @@ def _replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> R
     off = np.nan_to_num(dynamics.deviation(states, plan), nan=np.inf)
     dtype = problem.x_init.dtype
     replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
-    costs = evaluate(problem, replayed).cost
+    info = evaluate(problem, replayed)
     reached = [_reached(problem, states[c, -1], off[c, -1]) for c in range(chains)]
+    violation = np.nan_to_num(np.asarray(info.max_violation), nan=np.inf)
     return Replays(
         states=states,
         controls=controls,
         max_deviation=off.max(axis=1),
         final_deviation=off[:, -1],
-        cost=np.asarray(costs),
-        success=np.array(reached),
+        max_violation=violation,
+        cost=np.asarray(info.cost),
+        success=np.array(reached) & (violation < OUTSIDE),
     )
 
 

@@ -1,8 +1,8 @@
 """One file a task, each readable as an example.
 
-A task module has `make(horizon)`, which returns a Problem, and may have `SOLVER` (settings that
-suit it), `CHAINS` (a number of chains that suits a CPU) and `draw(axes, states)`, which draws its
-surroundings and a motion on matplotlib axes where there is no model to render.
+A task module has `make(horizon)`, which returns a Problem, and may have `CHAINS` (a number of
+chains that suits a CPU) and `draw(axes, states)`, which draws its surroundings and a motion on
+matplotlib axes where there is no model to render. All are solved with the default settings.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from mjx_drax import Geometric, Langevin, Problem, from_function
+from mjx_drax import Problem, from_function
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,14 +24,6 @@ WALL = np.array(
     [[-1, 1], [-0.5, 1], [0, 1], [0, 0.5], [0, 0], [0, -0.5], [0, -1], [-0.5, -1], [-1, -1]], float
 )
 CHAINS = 256
-SOLVER = Langevin(
-    iterations=300,
-    tail=100,
-    noise=Geometric(30.0, 0.01),
-    penalty=Geometric(100.0, 1000.0),
-    damping=Geometric(10.0, 0.1, 1e-3),
-    barrier_weight=Geometric(0.1, 1e-3, 1e-4),
-)
 
 
 def make(horizon: float = 11.9, wall: np.ndarray = WALL, name: str = "bug_trap") -> Problem:

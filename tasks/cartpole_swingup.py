@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax import Langevin, Problem, from_mjcf
+from mjx_drax import Problem, from_mjcf
 from mjx_drax.models import path
 
 DT = 0.02  # [s]
-SOLVER = Langevin(iterations=60, tail=30)
 
 
 def make(horizon: float = 2.0) -> Problem:

@@ -20,7 +20,6 @@ WALL = np.array(
     + [[0.0, 0.5], [0.0, 0.0], [0.0, -0.5]]
 )
 CHAINS = bug_trap.CHAINS
-SOLVER = bug_trap.SOLVER
 
 
 def make(horizon: float = 11.9) -> Problem:

@@ -11,18 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax import Geometric, Langevin, Problem, from_function
+from mjx_drax import Problem, from_function
 
 DT = 0.1  # [s]
 CHAINS = 256
-SOLVER = Langevin(
-    iterations=150,
-    tail=50,
-    noise=Geometric(0.1, 0.01),
-    penalty=Geometric(100.0, 100.0),
-    damping=Geometric(1e-3, 1e-4),
-    barrier_weight=Geometric(0.1, 1e-3, 1e-6),
-)
 
 
 def make(horizon: float = 4.9) -> Problem:

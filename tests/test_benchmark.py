@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Geometric, Langevin, benchmark, from_function, measure, tasks
+from mjx_drax import (
+    DraxError,
+    Geometric,
+    Langevin,
+    Restarts,
+    benchmark,
+    from_function,
+    measure,
+    tasks,
+)
 from mjx_drax.benchmark_plot import pooled
 from mjx_drax.cli import main
 from mjx_drax.peers import shooting
@@ -163,9 +172,11 @@ def test_suites_name_what_they_have():
 
 def test_evaluations_count_linearizations_and_the_ladder():
     problem = double_integrator()
-    linear, ladder = 1 + 2 + 1, len(measure.LADDER)
     solver = Langevin(iterations=7, tail=3)
-    assert measure.evaluations(solver, problem, 5) == 5 * KNOTS * (10 * linear + 3 * ladder)
+    linear, ladder = 1 + 2 + 1, len(solver.preconditioner.ladder)
+    assert measure.evaluations(solver, problem, 5, 10) == 5 * KNOTS * (10 * linear + 3 * ladder)
+    tries = Restarts(solver, descent=2)  # 5 iterations, then 10 an attempt
+    assert measure.evaluations(tries, problem, 1, 25) == KNOTS * (25 * linear + 9 * ladder)
 
 
 def test_first_certified_answer_comes_before_the_last_iteration():
@@ -234,13 +245,14 @@ def test_suite_of_peers(monkeypatch):
 
 
 def test_ablations_take_out_one_part():
-    solver = tasks.load("pendulum").SOLVER
+    solver = Restarts()
     found = benchmark.ablations(tasks.load("pendulum").make(), solver)
-    assert set(found) == {"no noise", "diagonal", "identity", "no tail"}
-    assert float(found["no noise"].noise(jnp.array(0.0))) == 0.0
-    assert found["no tail"].tail == 0
-    assert found["no tail"].iterations == solver.iterations + solver.tail
-    assert type(found["diagonal"].preconditioner).__name__ == "Diagonal"
+    assert set(found) == {"no restarts", "no noise", "diagonal", "identity", "no tail"}
+    assert found["no restarts"].attempts == 1
+    assert float(found["no noise"].flow.noise(jnp.array(0.0))) == 0.0
+    assert found["no tail"].flow.tail == 0
+    assert found["no tail"].flow.iterations == solver.flow.iterations + solver.flow.tail
+    assert type(found["diagonal"].flow.preconditioner).__name__ == "Diagonal"
     assert type(found["identity"].preconditioner).__name__ == "Identity"
 
 

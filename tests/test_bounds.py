@@ -18,6 +18,7 @@ from mjx_drax import (
     from_function,
     solve,
 )
+from mjx_drax.bounds import FOLLOW
 from mjx_drax.problem import Box, box
 
 K, NX, NU = 5, 3, 2
@@ -58,17 +59,53 @@ def test_derivatives_are_those_of_the_value():
         points, unravel = ravel_pytree(z)
 
         def value(p):
-            return BARRIER.value(BOUNDS, unravel(p)).sum()
+            return 0.3 * BARRIER.value(BOUNDS, unravel(p)).sum()
 
-        slope, curvature = BARRIER.derivatives(BOUNDS, z)
+        slope, curvature = BARRIER.derivatives(BOUNDS, z, 0.3)
         np.testing.assert_allclose(flat(slope), jax.jit(jax.grad(value))(points), rtol=1e-12)
         hessian = jax.jit(jax.hessian(value))(points)
         np.testing.assert_allclose(np.diag(flat(curvature)), hessian, rtol=1e-12)
 
 
+def test_multipliers_follow_newtons_step_towards_the_central_path():
+    rho, z = 0.3, inside()
+    central = BARRIER.multipliers(BOUNDS, z, rho)
+    v = jax.tree.map(lambda a: 1.5 * a, central)
+    step = jax.tree.map(lambda a: jnp.full_like(a, 1e-3), z)
+    new = jax.tree.map(jnp.add, z, step)
+    for sign, end, before, after in zip(
+        (1, -1), BOUNDS.sides(z), v, BARRIER.follow(BOUNDS, z, new, v, rho, 1.0), strict=True
+    ):
+        slack, bounded = sign * (flat(z) - flat(end)), jnp.isfinite(flat(end))
+        dv, ds = flat(after) - flat(before), sign * flat(step)
+        slack, dv, ds, old = (a[bounded] for a in (slack, dv, ds, flat(before)))
+        np.testing.assert_allclose(slack * old + slack * dv + old * ds, rho, rtol=1e-4)
+        assert not np.any(flat(after)[~bounded])
+
+
+def test_multipliers_stay_within_a_factor_of_the_central_path():
+    rho, z = 0.3, inside()
+    for share in (1e-9, 1e9):
+        wild = jax.tree.map(lambda a, share=share: share * a, BARRIER.multipliers(BOUNDS, z, rho))
+        held = BARRIER.follow(BOUNDS, z, z, wild, rho, 0.0)
+        central = BARRIER.multipliers(BOUNDS, z, rho)
+        allowed = np.clip(share, 1 / FOLLOW, FOLLOW)
+        for a, b in zip(held, central, strict=True):
+            np.testing.assert_allclose(flat(a), allowed * flat(b), rtol=1e-5)
+
+
+def test_curvature_is_the_multiplier_over_the_slack():
+    z = inside()
+    v = jax.tree.map(lambda a: 2.0 * a, BARRIER.multipliers(BOUNDS, z, 0.3))
+    slope, curvature = BARRIER.derivatives(BOUNDS, z, 0.3, v)
+    primal = BARRIER.derivatives(BOUNDS, z, 0.3)
+    np.testing.assert_array_equal(flat(slope), flat(primal[0]))
+    np.testing.assert_allclose(flat(curvature), 2.0 * flat(primal[1]), rtol=1e-6)
+
+
 def test_infinite_bounds_contribute_nothing():
     z = inside()
-    for part in (BARRIER.value(FREE, z), *map(flat, BARRIER.derivatives(FREE, z))):
+    for part in (BARRIER.value(FREE, z), *map(flat, BARRIER.derivatives(FREE, z, 1.0))):
         assert not np.any(part)
     far = jax.tree.map(lambda a: 1e9 * a, z)
     np.testing.assert_array_equal(flat(BARRIER.confine(FREE, z, far)), flat(far))
@@ -107,7 +144,7 @@ def test_no_number_of_huge_steps_leaves_the_box_or_breaks_the_derivatives(sign):
         assert_inside(BOUNDS, z)
     bounded = jnp.isfinite(flat(BOUNDS.sides(z)[sign > 0]))
     assert np.isfinite(BARRIER.value(BOUNDS, z)).all()
-    for part in BARRIER.derivatives(BOUNDS, z):
+    for part in BARRIER.derivatives(BOUNDS, z, 1.0):
         assert part.x.dtype == np.float32
         assert np.isfinite(flat(part)).all()
     back = BARRIER.confine(BOUNDS, z, inside())
@@ -117,7 +154,7 @@ def test_no_number_of_huge_steps_leaves_the_box_or_breaks_the_derivatives(sign):
 def test_derivatives_stay_finite_on_and_beyond_the_bounds():
     for shift in (0.0, 1e-9, -1e-9, -1.0, 1.0):
         z = Trajectory(jnp.full((K, NX), -1.0 + shift), jnp.full((K, NU), 0.0 + shift))
-        for part in BARRIER.derivatives(BOUNDS, z):
+        for part in BARRIER.derivatives(BOUNDS, z, 1.0):
             assert np.isfinite(flat(part)).all()
         assert np.isfinite(BARRIER.value(BOUNDS, z)).all()
 

@@ -225,7 +225,7 @@ def kkt():
 
 def test_a_fixed_end_is_reached_along_the_kkt_trajectory():
     u, x, multipliers = kkt()
-    found = solve(cart(**FIXED_END), chains=2)
+    found = solve(cart(**FIXED_END), chains=2, solver=Langevin())
     np.testing.assert_allclose(found.trajectories.x[:, -1], [TARGET] * 2, atol=1e-5)
     np.testing.assert_allclose(found.trajectories.u[:, :, 0], [u] * 2, atol=1e-5)
     np.testing.assert_allclose(found.trajectories.x, [x] * 2, atol=1e-5)

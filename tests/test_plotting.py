@@ -15,13 +15,14 @@ from mjx_drax import plotting
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import Langevin
 from mjx_drax.plotting import plot_solution
+from mjx_drax.restarts import Restarts
 from mjx_drax.solution import WITH_FEEDBACK, Solution, solve
 from mjx_drax.tasks import load
 
 
 @pytest.fixture(scope="module")
 def pendulum() -> Solution:
-    settings = replace(load("pendulum").SOLVER, iterations=30, tail=20)
+    settings = Restarts(Langevin(iterations=30, tail=20), descent=30, attempts=1)
     return solve(load("pendulum").make(), chains=8, solver=settings)
 
 

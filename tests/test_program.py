@@ -110,7 +110,7 @@ def test_inequalities_and_bounds_active_and_not():
     program = from_program(
         3, cost=cost, inequality=lambda x: G @ x - limit, bounds=([0.0, -4.0, -4.0], [4.0, 4.0, 2])
     )
-    solver = Langevin(tail=150, barrier_weight=Geometric(0.1, 0.01, 1e-7))
+    solver = Langevin(tail=150, barrier_weight=Geometric(0.1, 0.01, 3e-6))
     found = minimize(program, chains=4, solver=solver)
     np.testing.assert_allclose(found.x, np.tile(x, (4, 1)), atol=1e-5)
     np.testing.assert_allclose(found.inequality, np.tile(nu, (4, 1)), atol=1e-5)

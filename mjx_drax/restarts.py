@@ -1,0 +1,373 @@
+"""The default solver: descend first, then heat and cool again what has failed.
+
+The first attempt of every chain is a noise-free flow. It solves a problem that is not a trap, and
+it measures what a trap's annealing needs to know: the scale of costs of answers. Each further
+attempt works on the chains that are not done: infeasible, or far more expensive than the best.
+They start again from new random knots, are heated to a temperature of that scale, and are cooled
+slowly. Chains that are done leave their places in the batch to those that are not, so an attempt
+makes several tries for each, and every chain keeps the best that was found for it.
+
+Schedules are multiples of units that are measured, so no setting depends on the units of a cost:
+
+    cost     a share of the median cost of the initial knots, for mu, delta and rho; ten times as
+             much after an attempt in which not one chain became feasible
+    noise    the square root of the best cost so far, for sigma
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.errors import DraxError
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, State, advance, evaluate
+from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.schedules import Geometric
+
+CHUNK = 20
+"""Iterations between two reports, records of the history, and chances to interrupt; a hundredth
+of an attempt's where that is more."""
+
+UNIT = 1 / 300
+"""The unit of cost, as a share of the median cost of the initial knots."""
+
+MORE = 10.0
+"""Factor on the unit of cost after an attempt in which not one chain became feasible."""
+
+NEGLIGIBLE = 0.03
+"""Differences of cost below so many units do not count."""
+
+Progress = Callable[[int, int, Info], None]
+
+
+@dataclass(frozen=True)
+class Restarts:
+    """Descend, then heat what failed; every chain keeps the best of its attempts.
+
+    Attributes:
+        flow: the settings of an attempt, its schedules in units that are measured.
+        descent: noise-free iterations of the first attempt, which measures the units. None: the
+            first attempt is like the others, and the schedules are in the flow's own units.
+        attempts: largest number of attempts, the first included.
+        within: a chain is done if it is feasible and its cost exceeds the best chain's by at most
+            this share.
+        enough: share of chains to be done; then no further attempt is made.
+    """
+
+    flow: Langevin = field(
+        default_factory=lambda: Langevin(
+            iterations=150,
+            tail=60,
+            noise=Geometric(6.0, 1.5e-3),
+            penalty=Geometric(30.0, 3e3),
+            damping=Geometric(0.3, 0.1, 0.03),
+            barrier_weight=Geometric(0.1, 1e-3, 1e-5),
+        )
+    )
+    descent: int | None = 100
+    attempts: int = 5
+    within: float = 1.0
+    enough: float = 0.95
+
+    @property
+    def iterations(self) -> int:
+        """Largest number of iterations that a solve does."""
+        return self.noise_ends[-1] + self.flow.tail
+
+    @property
+    def noise_ends(self) -> list[int]:
+        """After how many iterations the noise of each attempt ends."""
+        flow = self.flow
+        first = flow.iterations if self.descent is None else self.descent
+        return [first + i * (flow.iterations + flow.tail) for i in range(self.attempts)]
+
+    def first(self, unit: float) -> Langevin:
+        """The settings of the first attempt, for a unit of cost."""
+        if self.descent is None:
+            return self.flow
+        return replace(self.flow, iterations=self.descent, scale=_scale(unit, 0.0))
+
+    def check(self, problem: Problem) -> None:
+        """Complain about settings that cannot work.
+
+        Raises:
+            DraxError: naming the setting, its value and the fix.
+        """
+        if not isinstance(self.flow, Langevin):
+            raise DraxError(f"flow is {self.flow!r}: give a Langevin.")
+        self.flow.check(problem)
+        for name, least in (("descent", 0), ("attempts", 1)):
+            count = getattr(self, name)
+            if name == "descent" and count is None:
+                continue
+            if not isinstance(count, int | np.integer) or count < least:
+                raise DraxError(f"{name} is {count!r}: give a whole number of at least {least}.")
+        for name in ("within", "enough"):
+            value = getattr(self, name)
+            if not (isinstance(value, float | int | np.number) and value >= 0):
+                raise DraxError(f"{name} is {value!r}: give a number of at least 0.")
+
+
+def with_iterations(solver: Langevin | Restarts, iterations: int) -> Langevin | Restarts:
+    """The same settings with other numbers of iterations, in proportion to those with noise."""
+    flow = solver.flow if isinstance(solver, Restarts) else solver
+    share = iterations / max(flow.iterations, 1)
+    flow = replace(flow, iterations=iterations, tail=round(share * flow.tail))
+    if isinstance(solver, Langevin):
+        return flow
+    descent = None if solver.descent is None else round(share * solver.descent)
+    return replace(solver, flow=flow, descent=descent)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Where chains stand after an attempt, and since which iteration each was feasible, or -1."""
+
+    state: State
+    info: Info
+    converged_at: np.ndarray
+
+    @property
+    def feasible(self) -> np.ndarray:
+        """Whether max|h| < `FEASIBLE`, (chains,)."""
+        return np.asarray(self.info.max_defect) < FEASIBLE
+
+
+@dataclass(frozen=True)
+class Run(Attempt):
+    """Where the chains of a solve ended, before any replay.
+
+    `records` holds what every place in the batch was at, which in later attempts are other tries
+    of fewer chains.
+    """
+
+    records: list[tuple[int, Info]]
+    compile_time: float
+    solve_time: float
+
+
+def run(
+    problem: Problem,
+    chains: int,
+    seed: int,
+    solver: Langevin | Restarts,
+    guess: Trajectory | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """The iterations of `solve`, for problems that need no replay; the same arguments.
+
+    A `Langevin` is one attempt with its schedules as they stand.
+    """
+    if not isinstance(chains, int | np.integer) or chains < 1:
+        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+        raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
+    if not isinstance(solver, Langevin | Restarts):
+        raise DraxError(f"solver is {solver!r}: give a Langevin or a Restarts.")
+    solver.check(problem)
+    if isinstance(solver, Langevin):
+        solver = Restarts(solver, descent=None, attempts=1)
+    return _Search(problem, chains, seed, guess, progress).run(solver)
+
+
+class _Search:
+    """The attempts of one solve."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        chains: int,
+        seed: int,
+        guess: Trajectory | None,
+        progress: Progress | None,
+    ) -> None:
+        self.problem, self.chains, self.seed = problem, chains, seed
+        self.guess, self.progress = guess, progress
+        self.records: list[tuple[int, Info]] = []
+        self.done = 0
+
+    def run(self, solver: Restarts) -> Run:
+        clock = time.perf_counter()
+        flow, total = solver.flow, solver.iterations
+        state, info = self._start(flow, 0)
+        _require_finite(self.problem, info)
+        unit = unit_of(np.asarray(info.cost))
+        first = solver.first(unit)
+        jax.block_until_ready(_advance(first, self.problem, state, 0, 0, int(flow.tail) > 0))
+        if solver.attempts > 1:
+            _gather((state, info), (state, info), np.arange(self.chains))
+        compile_time = time.perf_counter() - clock
+
+        clock = time.perf_counter()
+        self.records.append((0, info))
+        kept, complete = self._attempt(first, state, info, total)
+        for attempt in range(1, solver.attempts):
+            left = np.flatnonzero(~_finished(kept, solver.within, unit))
+            if not complete or len(left) <= (1.0 - solver.enough) * self.chains:
+                break
+            owners = np.resize(left, self.chains)
+            if not kept.feasible.any():
+                unit = MORE * unit  # the knots' cost says too little: penalize defects more
+            if solver.descent is not None:
+                flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
+            found, complete = self._attempt(flow, *self._start(flow, attempt), total)
+            kept = _best(kept, found, owners)
+        times = compile_time, time.perf_counter() - clock
+        return Run(kept.state, kept.info, kept.converged_at, self.records, *times)
+
+    def _start(self, flow: Langevin, attempt: int) -> tuple[State, Info]:
+        """New initial knots and random numbers for every place in the batch."""
+        key = jax.random.key(self.seed)
+        key_knots, key_noise = jax.random.split(jax.random.fold_in(key, attempt))
+        knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
+        return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
+
+    def _attempt(
+        self, flow: Langevin, state: State, info: Info, expected: int
+    ) -> tuple[Attempt, bool]:
+        """All iterations of one attempt, and whether it was not interrupted."""
+        total, tail = flow.iterations + flow.tail, int(flow.tail) > 0
+        done, before, converged_at = 0, self.done, np.full(self.chains, -1)
+        try:
+            while done < total:
+                stop = min(done + max(CHUNK, total // 100), total)
+                ahead = _advance(flow, self.problem, state, done, stop, tail)
+                (state, info), done = jax.block_until_ready(ahead), stop
+                self.done = before + done
+                self.records.append((self.done, info))
+                feasible = np.asarray(info.max_defect) < FEASIBLE
+                converged_at = np.where(feasible & (converged_at < 0), self.done, converged_at)
+                converged_at = np.where(feasible, converged_at, -1)
+                if self.progress is not None:
+                    self.progress(self.done, expected, info)
+        except KeyboardInterrupt:  # the chains as they were at the last report
+            return Attempt(state, info, converged_at), False
+        return Attempt(state, info, converged_at), True
+
+
+@partial(jax.jit, static_argnames="tail")
+def _advance(
+    flow: Langevin, problem: Problem, state: State, start: ArrayLike, stop: ArrayLike, tail: bool
+) -> tuple[State, Info]:
+    """`advance` and `evaluate` in one launch."""
+    state = advance(flow, problem, state, start, stop, tail)
+    return state, evaluate(problem, state.trajectory)
+
+
+@jax.jit
+def _init(flow: Langevin, problem: Problem, knots: Trajectory, key: Array) -> tuple[State, Info]:
+    """`Langevin.init` and `evaluate` in one launch."""
+    state = flow.init(problem, knots, key)
+    return state, evaluate(problem, state.trajectory)
+
+
+def _scale(cost: float, noise: float) -> Scale:
+    """Units as numbers of one type, so that other values do not recompile."""
+    return Scale(np.float32(cost), np.float32(noise))
+
+
+def _median(costs: np.ndarray) -> float:
+    """Median of the absolute values of finite costs."""
+    finite = np.abs(costs[np.isfinite(costs)])
+    return float(np.median(finite)) if finite.size else 0.0
+
+
+def unit_of(costs: np.ndarray) -> float:
+    """The unit of cost, from the costs of initial knots (chains,)."""
+    return UNIT * _median(costs) or 1.0
+
+
+def _level(kept: Attempt, unit: float) -> float:
+    """The scale of the costs of answers: the best so far, or what all have if none is feasible."""
+    costs = np.asarray(kept.info.cost)
+    level = abs(costs[kept.feasible].min()) if kept.feasible.any() else _median(costs)
+    return max(float(level), NEGLIGIBLE * unit)
+
+
+def _finished(kept: Attempt, within: float, unit: float) -> np.ndarray:
+    """Which chains are done, (chains,)."""
+    costs = np.where(kept.feasible, np.asarray(kept.info.cost), np.inf)
+    best = costs.min()
+    if not np.isfinite(best):
+        return kept.feasible
+    return costs <= best + max(within * abs(best), NEGLIGIBLE * unit)
+
+
+def _best(kept: Attempt, found: Attempt, owners: np.ndarray) -> Attempt:
+    """For every chain the best of what it has and of what was found for it.
+
+    owners (chains,) says for which chain each place in the batch has worked. Feasible beats
+    infeasible, then the cheaper or the less infeasible wins.
+    """
+    chains = len(owners)
+
+    def both(values: Callable[[Attempt], ArrayLike]) -> np.ndarray:
+        return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
+
+    feasible = both(lambda a: a.feasible)
+    defect = np.nan_to_num(both(lambda a: a.info.max_defect), nan=np.inf)
+    rank = np.where(feasible, both(lambda a: a.info.cost), defect)
+    of = np.concatenate([np.arange(chains), owners])
+    order = np.lexsort((rank, ~feasible, of))
+    source = order[np.unique(of[order], return_index=True)[1]]
+    state, info = _gather((kept.state, kept.info), (found.state, found.info), source)
+    return Attempt(state, info, both(lambda a: a.converged_at)[source])
+
+
+@jax.jit
+def _gather(kept: Any, found: Any, source: Array) -> Any:
+    """Rows `source` (chains,) of two batches, one after the other."""
+    chains = len(source)
+
+    def rows(a: Array, b: Array) -> Array:
+        mine = (source < chains).reshape(-1, *[1] * (a.ndim - 1))
+        return jnp.where(mine, a[source % chains], b[source % chains])
+
+    return jax.tree.map(rows, kept, found)
+
+
+def initial_knots(
+    problem: Problem, chains: int, guess: Trajectory | None, key: Array
+) -> Trajectory:
+    """Initial knots for every chain: drawn, or the guess broadcast to all of them."""
+    if guess is None:
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
+        if problem.guess is not None:  # not compiled: problems with other guesses compare equal
+            return jax.vmap(problem.draw)(keys)
+        return _draw(problem, keys)
+    K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
+    knots = []
+    for label, value, size in (("x", guess.x, nx), ("u", guess.u, nu)):
+        array = np.asarray(value, problem.x_init.dtype)
+        if array.shape not in ((K, size), (chains, K, size)):
+            raise DraxError(
+                f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
+                f"({chains}, {K}, {size}) with one for each chain."
+            )
+        if not np.isfinite(array).all():
+            raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
+        knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
+    return Trajectory(knots[0], knots[1])
+
+
+_draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))
+
+
+def _require_finite(problem: Problem, info: Info) -> None:
+    """Complain if no chain could possibly start."""
+    for label, values in (("cost", info.cost), ("dynamics", info.max_defect)):
+        if not np.isfinite(values).any():
+            raise DraxError(
+                f"the {label} of {problem.name} is {float(values[0])} at the initial knots of "
+                f"every chain ({len(values)} tried): make it finite there (no 0/0, no log or sqrt "
+                "of negative numbers), or narrow the scatter of the initial knots."
+            )
