@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.dynamics import Static
 from mjx_drax.linalg import symmetric
+from mjx_drax.scalar import scalarized
 
 Function = Callable[[Array], Array]
 
@@ -50,11 +51,11 @@ class Autodiff:
             value = function(dz)
             return value, value
 
-        return jax.jacfwd(with_value, has_aux=True)(jnp.zeros(size))
+        return scalarized(lambda: jax.jacfwd(with_value, has_aux=True)(jnp.zeros(size)))()
 
     def hessian(self, function: Function, size: int) -> Array:
         """Hessian (n, n)."""
-        return jax.jacfwd(jax.jacfwd(function))(jnp.zeros(size))
+        return scalarized(lambda: jax.jacfwd(jax.jacfwd(function))(jnp.zeros(size)))()
 
 
 @register_dataclass
