@@ -51,11 +51,30 @@ class Autodiff:
             value = function(dz)
             return value, value
 
-        return scalarized(lambda: jax.jacfwd(with_value, has_aux=True)(jnp.zeros(size)))()
+        return jax.jacfwd(with_value, has_aux=True)(jnp.zeros(size))
 
     def hessian(self, function: Function, size: int) -> Array:
         """Hessian (n, n)."""
-        return scalarized(lambda: jax.jacfwd(jax.jacfwd(function))(jnp.zeros(size)))()
+        return jax.jacfwd(jax.jacfwd(function))(jnp.zeros(size))
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class InScalars:
+    """The derivatives of another differentiator, in scalar arithmetic where that is possible.
+
+    Of the tangents of a mechanism most entries are zero, and cost nothing then; see `scalar`.
+    """
+
+    by: Differentiator
+
+    def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
+        """Jacobian (m, n) and value (m,)."""
+        return scalarized(lambda: self.by.jacobian(function, size, key))()
+
+    def hessian(self, function: Function, size: int) -> Array:
+        """Hessian (n, n)."""
+        return scalarized(lambda: self.by.hessian(function, size))()
 
 
 @register_dataclass

@@ -21,6 +21,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax._mujoco import mujoco
+from mjx_drax.derivatives import Autodiff, InScalars
 from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
 from mjx_drax.problem import (
@@ -39,6 +40,11 @@ from mjx_drax.scalar import scalarized
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     from mujoco import mjx  # announces on import that warp is missing; nothing here needs warp
+
+
+STEP_LIMIT = 2_000
+"""Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
+take several times as many, and compilers need minutes for tens of thousands."""
 
 
 class HostModel:
@@ -82,7 +88,7 @@ class Structure:
         """The same model, in which what is known stands as a constant."""
         leaves, tree = jax.tree.flatten(model)
         pairs = zip(leaves, self.known, strict=True)
-        return tree.unflatten([_imposed(leaf, known) for leaf, known in pairs])
+        return jax.tree.unflatten(tree, [_imposed(leaf, known) for leaf, known in pairs])
 
 
 def _known(path: tuple[Any, ...], leaf: Any) -> tuple[tuple[int, ...], bytes, bytes] | None:
@@ -161,6 +167,10 @@ class MjxDynamics(Dynamics):
     def observe(self, x: Array, u: Array) -> mjx.Data:
         """`mjx.Data` at the knot after `mjx.forward`: what a cost does not read is not computed."""
         return _observe(self.model, self.structure, x, u)
+
+    def differentiator(self, by: Any) -> Any:
+        """Exact derivatives in scalar arithmetic; others as they are."""
+        return InScalars(by) if isinstance(by, Autodiff) else by
 
     def replay(
         self,
@@ -263,7 +273,7 @@ def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Ar
         data = jax.lax.scan(advance, _data(model, x, u), length=substeps)[0]
         return jnp.concatenate([data.qpos, data.qvel, data.act])
 
-    return scalarized(steps)(model, x, u)
+    return scalarized(steps, STEP_LIMIT)(model, x, u)
 
 
 # One trace of each, shared by all that differentiate it

@@ -11,8 +11,8 @@ gather, concatenate, ...) then happens here, at trace time; what computes is bou
 with known numbers folded and equal operations shared. The result is elementwise code, which fuses.
 
 The first three identities hold for finite x only: where x is infinite or NaN, the scalarized
-function returns the 0, not NaN. All others are exact; what is left of a difference to f is
-rounding, because sums are taken in another order.
+function returns the 0, not NaN; and x + 0 keeps the sign of x = -0. All others are exact; what is
+left of a difference to f is rounding, because sums are taken in another order.
 
 A function with an operation that has no rule here, or with too many of them, is evaluated as it is.
 """
@@ -20,7 +20,6 @@ A function with an operation that has no rule here, or with too many of them, is
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce, wraps
 from typing import Any
@@ -28,25 +27,28 @@ from typing import Any
 import jax
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun, primitives
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
-LIMIT = 10_000
-"""Scalar operations of a function, above which it is left as it is."""
+LIMIT = 8_000
+"""Scalar operations of a function, above which it is left as it is: XLA would compile for longer
+than it takes for the array operations."""
 
 Scalar = Any
 """A known number (np.generic) or a traced scalar of shape ()."""
 
 
-class Unsupported(Exception):  # noqa: N818  a signal to fall back; nobody sees it
+class Unsupported(Exception):
     """A function that cannot, or should not, be scalarized."""
 
 
-def scalarized(function: Callable[..., Any]) -> Callable[..., Any]:
+def scalarized(function: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
     """The same function of pytrees of arrays, in scalar arithmetic where that is possible.
 
-    Arrays that the function closes over and that are not traced are known numbers, whose zeros and
-    ones are used. Arguments are not. Functions with their own derivative rule (custom_jvp,
-    custom_vjp) are not opened, because the result may be differentiated: differentiate first.
+    With more than `limit` operations (each entry of a traced array that is read counts as one) it
+    stays as it is. Arrays that the function closes over and that are not traced are known numbers,
+    whose zeros and ones are used. Arguments are not. Functions with their own derivative rule
+    (custom_jvp, custom_vjp) are not opened, because the result may be differentiated:
+    differentiate first.
     """
 
     @wraps(function)
@@ -54,7 +56,7 @@ def scalarized(function: Callable[..., Any]) -> Callable[..., Any]:
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
         flat = jax.tree.leaves(arguments)
         try:
-            outputs = _Evaluation().outputs(closed, flat)
+            outputs = _Evaluation(limit).outputs(closed, flat)
         except Unsupported:
             outputs = jaxpr_as_fun(closed)(*flat)
         return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
@@ -69,8 +71,8 @@ class _Evaluation:
     as a JAX array stays one until it is read.
     """
 
-    def __init__(self) -> None:
-        self.operations = 0
+    def __init__(self, limit: int = LIMIT) -> None:
+        self.limit, self.operations = limit, 0
         self.memo: dict[Any, Scalar] = {}
         self.alive: list[Any] = []  # ids are keys of `memo`: what they name must not be freed
         self.negated: dict[int, Scalar] = {}  # id of -x: x
@@ -116,7 +118,8 @@ class _Evaluation:
         if name in _STRUCTURE:
             moved = _STRUCTURE[name](values, params)
             return [_tidy(v, out.aval) for v, out in zip(moved, equation.outvars, strict=True)]
-        shape, dtype = equation.outvars[0].aval.shape, equation.outvars[0].aval.dtype
+        aval: Any = equation.outvars[0].aval
+        shape, dtype = aval.shape, aval.dtype
         if all(value.dtype != object for value in values):
             if name in _NUMPY:
                 return [np.broadcast_to(_known(name, values, params), shape).astype(dtype)]
@@ -131,10 +134,10 @@ class _Evaluation:
                 self.apply(equation.primitive, operands, params)
                 for operands in zip(*columns, strict=True)
             ]
-            return [_tidy(_array(scalars, shape), equation.outvars[0].aval)]
+            return [_tidy(_array(scalars, shape), aval)]
         if name in _UNROLLED:
             out = _UNROLLED[name](self, [_boxed(value) for value in values], params)
-            return [_tidy(out, equation.outvars[0].aval)]
+            return [_tidy(out, aval)]
         raise Unsupported(f"{name} of traced scalars")
 
     def split(self, value: Any) -> np.ndarray:
@@ -149,10 +152,12 @@ class _Evaluation:
             if not _is_numeric(value.dtype):
                 raise Unsupported("keys")
             self.count(value.size)
-            scalars = [value]
+            scalars: list[Scalar] = [value]
             if value.shape:
                 flat = lax.reshape(value, (value.size,))
-                scalars = [lax.squeeze(lax.slice(flat, [i], [i + 1]), [0]) for i in range(flat.size)]
+                scalars = [
+                    lax.squeeze(lax.slice(flat, [i], [i + 1]), [0]) for i in range(flat.size)
+                ]
             self.alive.append(value)
             self.entries[id(value)] = _tidy(_array(scalars, value.shape), value)
         return self.entries[id(value)]
@@ -160,8 +165,8 @@ class _Evaluation:
     def count(self, operations: int) -> None:
         """Add to the number of operations, which has a limit."""
         self.operations += operations
-        if self.operations > LIMIT:
-            raise Unsupported(f"more than {LIMIT} scalar operations")
+        if self.operations > self.limit:
+            raise Unsupported(f"more than {self.limit} scalar operations")
 
     def apply(
         self, primitive: Any, operands: Sequence[Scalar], params: dict[str, Any] | None = None
@@ -313,7 +318,7 @@ def _joined(value: np.ndarray) -> Any:
 
 def _is_numeric(dtype: Any) -> bool:
     """Whether numpy knows the dtype, which it does not of random keys and of float0."""
-    return jax.dtypes.issubdtype(dtype, np.number) or dtype == bool
+    return jax.dtypes.issubdtype(dtype, np.number) or dtype == np.bool_
 
 
 def _is(scalar: Scalar, number: int) -> bool:
@@ -469,7 +474,6 @@ def _windows(
     sizes: Sequence[int],
     index_map: Sequence[int],
     batching: Sequence[tuple[int, int]],
-    mode: Any,
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Where the windows of a gather or scatter lie in an operand of this shape.
 
@@ -499,9 +503,7 @@ def _gather(values: list[np.ndarray], params: dict[str, Any]) -> list[np.ndarray
     batching = list(
         zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True)
     )
-    coordinates, inside = _windows(
-        indices, operand.shape, sizes, numbers.start_index_map, batching, mode
-    )
+    coordinates, inside = _windows(indices, operand.shape, sizes, numbers.start_index_map, batching)
     if mode == lax.GatherScatterMode.FILL_OR_DROP and not inside.all():
         raise Unsupported("a gather that fills")
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
@@ -525,7 +527,7 @@ def _scattered(
         zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True)
     )
     coordinates, inside = _windows(
-        indices, operand.shape, sizes, numbers.scatter_dims_to_operand_dims, batching, mode
+        indices, operand.shape, sizes, numbers.scatter_dims_to_operand_dims, batching
     )
     used = np.broadcast_to(
         (inside | (mode == lax.GatherScatterMode.CLIP)).reshape(*batch, *(1 for _ in sizes)),
@@ -568,9 +570,7 @@ _STRUCTURE: dict[str, _Rule] = {
 # Sums, products and factorizations, unrolled
 
 
-def _dot_general(
-    ev: _Evaluation, values: list[np.ndarray], params: dict[str, Any]
-) -> np.ndarray:
+def _dot_general(ev: _Evaluation, values: list[np.ndarray], params: dict[str, Any]) -> np.ndarray:
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
 
     def rows(value: np.ndarray, batch: Sequence[int], contract: Sequence[int]) -> Any:
@@ -680,7 +680,7 @@ _UNROLLED: dict[str, Callable[..., np.ndarray]] = {
     "reduce_prod": _fold(lax.mul_p),
     "reduce_sum": _fold(lax.add_p),
     "scatter-add": lambda ev, v, p: _scattered(v, p, ev.add),
-    "scatter_mul": lambda ev, v, p: _scattered(v, p, ev.mul),
+    "scatter-mul": lambda ev, v, p: _scattered(v, p, ev.mul),
     "triangular_solve": _each_matrix(_triangular_solve),
 }
 
