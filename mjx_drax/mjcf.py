@@ -82,7 +82,8 @@ class Structure:
     @classmethod
     def of(cls, model: mjx.Model) -> Structure:
         """The structure of a model; nothing is known of the leaves that are traced."""
-        return cls(tuple(map(_known, *zip(*jax.tree_util.tree_leaves_with_path(model)))))
+        leaves = jax.tree_util.tree_leaves_with_path(model)
+        return cls(tuple(_known(path, leaf) for path, leaf in leaves))
 
     def imposed(self, model: mjx.Model) -> mjx.Model:
         """The same model, in which what is known stands as a constant."""

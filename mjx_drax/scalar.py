@@ -124,6 +124,9 @@ class _Evaluation:
             if name in _NUMPY:
                 return [np.broadcast_to(_known(name, values, params), shape).astype(dtype)]
             if name not in _UNROLLED or not all(value.size for value in values):
+                avals: list[Any] = [variable.aval for variable in equation.outvars]
+                if not all(_is_numeric(a.dtype) for a in avals):
+                    raise Unsupported("keys")
                 with jax.ensure_compile_time_eval():
                     out = equation.primitive.bind(*map(jax.numpy.asarray, values), **params)
                 several = equation.primitive.multiple_results
@@ -172,7 +175,8 @@ class _Evaluation:
         self, primitive: Any, operands: Sequence[Scalar], params: dict[str, Any] | None = None
     ) -> Scalar:
         """An elementwise primitive of scalars: simplified, remembered, or bound."""
-        name, params = primitive.name, params or {}
+        name = primitive.name
+        params = _PARAMS.get(name, {}) if params is None else params
         simpler = self.simplified(name, operands, params)
         if simpler is not None:
             return simpler
@@ -388,6 +392,15 @@ _ELEMENTWISE = {
     *_NUMPY,
     *("acosh", "asinh", "atanh", "cbrt", "cosh", "erf", "erf_inv", "exp2", "expm1", "integer_pow"),
     *("log1p", "logistic", "nextafter", "pow", "reduce_precision", "round", "rsqrt", "sinh"),
+}
+
+
+# The parameters that lax gives to the operations which are bound here: versions of JAX differ
+_PARAMS: dict[str, dict[str, Any]] = {
+    equation.primitive.name: equation.params
+    for equation in jax.make_jaxpr(
+        lambda x: [x + x, x - x, x * x, x / x, -x, lax.sqrt(x), lax.max(x, x), lax.min(x, x)]
+    )(np.float32(1.0)).eqns
 }
 
 
@@ -642,7 +655,7 @@ def _cholesky(ev: _Evaluation, values: Sequence[np.ndarray], params: dict[str, A
     for i in range(len(A)):
         for j in range(i + 1):
             rest = ev.sub(A[i, j], ev.dot(L[i, :j], L[j, :j], dtype))
-            L[i, j] = ev.apply(lax.sqrt_p, (rest,), _SQRT) if i == j else ev.div(rest, L[j, j])
+            L[i, j] = ev.apply(lax.sqrt_p, (rest,)) if i == j else ev.div(rest, L[j, j])
     return L
 
 
@@ -665,7 +678,6 @@ def _triangular_solve(
     return X if left else X.T
 
 
-_SQRT: dict[str, Any] = jax.make_jaxpr(lax.sqrt)(1.0).eqns[0].params
 _UNROLLED: dict[str, Callable[..., np.ndarray]] = {
     "cholesky": _each_matrix(_cholesky),
     "cummax": _cumulate(lax.max_p),
