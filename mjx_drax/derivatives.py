@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.dynamics import Static
 from mjx_drax.linalg import symmetric
+from mjx_drax.scalar import scalarized
 
 Function = Callable[[Array], Array]
 
@@ -55,6 +56,25 @@ class Autodiff:
     def hessian(self, function: Function, size: int) -> Array:
         """Hessian (n, n)."""
         return jax.jacfwd(jax.jacfwd(function))(jnp.zeros(size))
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class InScalars:
+    """The derivatives of another differentiator, in scalar arithmetic where that is possible.
+
+    Of the tangents of a mechanism most entries are zero, and cost nothing then; see `scalar`.
+    """
+
+    by: Differentiator
+
+    def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
+        """Jacobian (m, n) and value (m,)."""
+        return scalarized(lambda: self.by.jacobian(function, size, key))()
+
+    def hessian(self, function: Function, size: int) -> Array:
+        """Hessian (n, n)."""
+        return scalarized(lambda: self.by.hessian(function, size))()
 
 
 @register_dataclass

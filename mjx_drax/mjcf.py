@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import register_dataclass
 from numpy.typing import ArrayLike
 
 from mjx_drax._mujoco import mujoco
-from mjx_drax.dynamics import Dynamics, Static
+from mjx_drax.derivatives import Autodiff, InScalars
+from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
 from mjx_drax.problem import (
     Aside,
@@ -36,9 +36,15 @@ from mjx_drax.problem import (
     scatter_box,
     vector,
 )
+from mjx_drax.scalar import scalarized
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     from mujoco import mjx  # announces on import that warp is missing; nothing here needs warp
+
+
+STEP_LIMIT = 2_000
+"""Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
+take several times as many, and compilers need minutes for tens of thousands."""
 
 
 class HostModel:
@@ -58,7 +64,56 @@ class HostModel:
         return hash(HostModel)
 
 
-@register_dataclass
+@dataclass(frozen=True)
+class Structure:
+    """The numbers of a model that its compiled functions rely on.
+
+    These are the zeros of its float arrays (a joint's offset, an inertia's tilt, a damping that is
+    not there), the ones in its axes and quaternions, and all integers: most of the arithmetic of a
+    step is multiplication by them. All other numbers may change without recompiling.
+
+    Attributes:
+        known: for each leaf of the model its shape, which entries are known, and the entries, the
+            latter two as bytes, which can be hashed; None where nothing is known.
+    """
+
+    known: tuple[tuple[tuple[int, ...], bytes, bytes] | None, ...]
+
+    @classmethod
+    def of(cls, model: mjx.Model) -> Structure:
+        """The structure of a model; nothing is known of the leaves that are traced."""
+        leaves = jax.tree_util.tree_leaves_with_path(model)
+        return cls(tuple(_known(path, leaf) for path, leaf in leaves))
+
+    def imposed(self, model: mjx.Model) -> mjx.Model:
+        """The same model, in which what is known stands as a constant."""
+        leaves, tree = jax.tree.flatten(model)
+        pairs = zip(leaves, self.known, strict=True)
+        return jax.tree.unflatten(tree, [_imposed(leaf, known) for leaf, known in pairs])
+
+
+def _known(path: tuple[Any, ...], leaf: Any) -> tuple[tuple[int, ...], bytes, bytes] | None:
+    if isinstance(leaf, jax.core.Tracer) or not hasattr(leaf, "shape") or leaf.size > 4096:
+        return None
+    value = np.asarray(leaf)
+    if value.dtype.kind != "f":
+        return value.shape, np.ones(value.shape, bool).tobytes(), value.astype(float).tobytes()
+    known = value == 0
+    if str(path[-1]).endswith(("axis", "quat")):
+        known |= np.abs(value) == 1
+    return value.shape, known.tobytes(), np.where(known, value, 0).astype(float).tobytes()
+
+
+def _imposed(leaf: Array, known: tuple[tuple[int, ...], bytes, bytes] | None) -> Array:
+    if known is None or known[0] != leaf.shape:
+        return leaf
+    which, value = (
+        np.frombuffer(data, dtype).reshape(leaf.shape)
+        for data, dtype in zip(known[1:], (bool, float), strict=True)
+    )
+    return jax.lax.select(which, value.astype(leaf.dtype), leaf)
+
+
 @dataclass(frozen=True)
 class MjxDynamics(Dynamics):
     """`substeps` steps of MJX under constant control; x = [qpos (nq), qvel (nv), act (na)].
@@ -68,12 +123,18 @@ class MjxDynamics(Dynamics):
         dt: time between knots [s], substeps times the model's timestep.
         host: the model for MuJoCo's C engine.
         substeps: physics steps in one control step.
+        structure: what compiled functions know of the model, found when this is constructed.
     """
 
     model: mjx.Model
     dt: float
-    host: HostModel = field(metadata=Static)
-    substeps: int = field(metadata=Static)
+    host: HostModel
+    substeps: int
+    structure: Structure = field(init=False)
+
+    def __post_init__(self) -> None:
+        """A model that is put in later brings its own structure, by `dataclasses.replace` too."""
+        object.__setattr__(self, "structure", Structure.of(self.model))
 
     @property
     def mj_model(self) -> mujoco.MjModel:
@@ -102,11 +163,15 @@ class MjxDynamics(Dynamics):
 
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u), (nx,)."""
-        return _step(self.model, self.substeps, x, u)
+        return _step(self.model, self.structure, self.substeps, x, u)
 
     def observe(self, x: Array, u: Array) -> mjx.Data:
         """`mjx.Data` at the knot after `mjx.forward`: what a cost does not read is not computed."""
-        return _observe(self.model, x, u)
+        return _observe(self.model, self.structure, x, u)
+
+    def differentiator(self, by: Any) -> Any:
+        """Exact derivatives in scalar arithmetic; others as they are."""
+        return InScalars(by) if isinstance(by, Autodiff) else by
 
     def replay(
         self,
@@ -145,6 +210,23 @@ class MjxDynamics(Dynamics):
         return data
 
 
+def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    static = (dynamics.host, dynamics.substeps, dynamics.structure)
+    return (dynamics.model, dynamics.dt), static
+
+
+def _unflatten(static: tuple[Any, ...], traced: Iterable[Any]) -> MjxDynamics:
+    """The same dynamics inside a compiled function, where only the structure is known."""
+    dynamics = object.__new__(MjxDynamics)
+    names = ("model", "dt", "host", "substeps", "structure")
+    for name, value in zip(names, (*traced, *static), strict=True):
+        object.__setattr__(dynamics, name, value)
+    return dynamics
+
+
+jax.tree_util.register_pytree_node(MjxDynamics, _flatten, _unflatten)
+
+
 _BLOWN_UP = [
     int(warning)
     for warning in (
@@ -178,20 +260,26 @@ def _data(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
     return mjx.make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
 
 
-@jax.jit
-def _observe(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
-    return mjx.forward(model, _data(model, x, u))
+def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:
+    return mjx.forward(structure.imposed(model), _data(model, x, u))
 
 
-def _step(model: mjx.Model, substeps: int, x: Array, u: Array) -> Array:
-    def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-        return mjx.step(model, data), None
+def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Array) -> Array:
+    def steps(model: mjx.Model, x: Array, u: Array) -> Array:
+        model = structure.imposed(model)
 
-    data = jax.lax.scan(advance, _data(model, x, u), length=substeps)[0]
-    return jnp.concatenate([data.qpos, data.qvel, data.act])
+        def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            return mjx.step(model, data), None
+
+        data = jax.lax.scan(advance, _data(model, x, u), length=substeps)[0]
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+    return scalarized(steps, STEP_LIMIT)(model, x, u)
 
 
-_step = jax.jit(_step, static_argnums=1)  # one trace of f, shared by all that differentiate it
+# One trace of each, shared by all that differentiate it
+_observe = jax.jit(_observe, static_argnums=1)
+_step = jax.jit(_step, static_argnums=(1, 2))
 
 
 def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:

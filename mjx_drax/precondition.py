@@ -201,7 +201,7 @@ class Model:
 def expand(problem: Problem, trajectory: Trajectory, by: Differentiator, key: Array) -> Model:
     """Differentiate dynamics, costs and constraints at every knot."""
     dynamics = problem.dynamics
-    ndx, nu = dynamics.ndx, dynamics.nu
+    ndx, nu, by = dynamics.ndx, dynamics.nu, dynamics.differentiator(by)
     keys = jax.random.split(key, problem.horizon + 1)
 
     def stage(x: Array, u: Array, key: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

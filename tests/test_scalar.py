@@ -1,0 +1,356 @@
+"""Scalar arithmetic against the functions it stands for; what it prunes, and when it gives up."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from mjx_drax import from_mjcf, mjcf, scalar
+from mjx_drax.derivatives import Autodiff, InScalars
+from mjx_drax.models import path
+from mjx_drax.scalar import scalarized
+
+RNG = np.random.default_rng(0)
+A = RNG.uniform(0.5, 2.0, (3, 4))
+MANY = np.array([[0, 2], [1, 1], [2, 3]])
+
+
+def moved(x):
+    """Numbers change places."""
+    return [
+        x.reshape(4, 3)[::2].T,
+        x[1:, ::-1][..., None],
+        jnp.concatenate([x, x[:1] * 0.5]),
+        jnp.stack([x[0], x[1]], axis=1),
+        jnp.pad(x, ((1, 2), (0, 1)), constant_values=7.0),
+        lax.pad(x, 1.0, [(-1, 2, 1), (1, -1, 2)]),
+        jnp.split(x, [1, 3], axis=1),
+        jnp.tile(x, (2, 1)),
+        jnp.broadcast_to(x[:, None, :1], (3, 2, 4)),
+        jnp.where(np.arange(4) % 2 == 0, x, -x),
+        x.astype(int).astype(x.dtype),
+    ]
+
+
+def indexed(x):
+    """Gathers and scatters with known indices."""
+    rows, columns = MANY.T
+    many = jax.vmap(lambda row, i: row[i])(x, columns)  # batching dimensions
+    return [
+        x[rows, columns],
+        x[:, np.array([3, 0, 0])],
+        x[np.array([2, 0])],
+        many,
+        lax.dynamic_slice(x, (1, 9), (2, 2)),
+        lax.dynamic_update_slice(x, x[:2, :2] * 2.0, (1, 1)),
+        x.at[rows, columns].set(5.0),
+        x.at[np.array([0, 0, 1]), 1].add(x[0, :3]),
+        x.at[np.array([1, 2])].multiply(x[:2], unique_indices=True),
+        x.at[np.array([1, 8])].set(3.0, mode="drop"),
+        jax.vmap(lambda row, i: row.at[i].add(1.0))(x, columns),
+    ]
+
+
+def elementwise(x):
+    return [
+        jnp.sin(x) * jnp.exp(-x) / jnp.sqrt(x),
+        jnp.maximum(x, 1.0) ** 3 + jnp.arctan2(x, 1.0 - x),
+        jnp.clip(x, 0.7, 1.3) - jnp.abs(-x) % 0.4,
+        jnp.where((x > 1.0) & ~(x > 1.5) | (x < 0.6), x, jnp.tanh(x)),
+        jnp.sign(x - 1.0) + jnp.floor(2.0 * x) + jnp.log1p(x) + x**2.5 + lax.rsqrt(x),
+    ]
+
+
+def reduced(x):
+    return [
+        x @ jnp.cos(x).T,
+        jnp.einsum("ij,ij->i", x, x**2),
+        jnp.einsum("ij,kj->jik", x, x),
+        x.sum(0),
+        x.max(1),
+        x.min(),
+        x.prod(axis=(0, 1)),
+        jnp.any(x > 1.9, axis=1).astype(x.dtype),
+        jnp.all(x > 0.6, axis=0).astype(x.dtype),
+        jnp.cumsum(x, 1),
+        jnp.cumprod(x, 0),
+        lax.cummax(x, 1, reverse=True),
+    ]
+
+
+def factored(x):
+    matrix = jnp.eye(3) + x[:, :3] @ x[:, :3].T
+    L = jnp.linalg.cholesky(matrix)
+    solves = [
+        lax.linalg.triangular_solve(L, b, left_side=left, lower=True, transpose_a=trans)
+        for left, b in ((True, x), (False, x.T))
+        for trans in (False, True)
+    ]
+    upper = jax.scipy.linalg.solve_triangular(L.T, x, lower=False, unit_diagonal=True)
+    batch = jnp.linalg.cholesky(jnp.stack([matrix, 2.0 * matrix]))
+    return [L, *solves, upper, batch, jax.scipy.linalg.cho_solve((L, True), x)]
+
+
+def controlled(x):
+    def body(carry, row):
+        return carry + jnp.sin(row), carry * row
+
+    rows = lax.scan(body, x[0], x, reverse=True)
+    loop = lax.fori_loop(0, 3, lambda i, y: y + x[i], x[0])
+    until = lax.while_loop(lambda c: c[0] < 4, lambda c: (c[0] + 2, c[1] * x[0]), (0, x[1]))
+    branch = lax.cond(np.True_, jnp.sin, jnp.cos, x)
+    return [rows, loop, until[1], branch, jax.checkpoint(jnp.sin)(x), jax.jit(jnp.cos)(x)]
+
+
+def close(seen, wanted, rtol):
+    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(wanted), strict=True):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        scale = max(1.0, np.abs(b).max(initial=0.0))
+        np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol * scale)
+
+
+@pytest.fixture
+def strictly(monkeypatch):
+    """Falling back is a failure."""
+
+    def refuse(closed):
+        raise AssertionError("fell back")
+
+    monkeypatch.setattr(scalar, "jaxpr_as_fun", refuse)
+
+
+@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("function", [moved, indexed, elementwise, reduced, factored, controlled])
+def test_every_class_of_operations(function, x64, strictly):
+    with jax.enable_x64(x64):
+        x = jnp.asarray(A)
+        for f in (function, lambda x: jax.jacfwd(function)(x)):
+            close(jax.jit(scalarized(f))(x), jax.jit(f)(x), 1e-12 if x64 else 3e-5)
+
+
+def test_inside_of_every_transformation(strictly):
+    with jax.enable_x64(True):
+        x = jnp.asarray(RNG.uniform(0.5, 2.0, (5, 3, 4)))
+
+        def f(x):
+            return sum(jnp.sum(jnp.sin(y)) for y in factored(x))
+
+        g = scalarized(f)
+        close(jax.vmap(g)(x), jax.vmap(f)(x), 1e-12)
+        close(jax.vmap(jax.grad(g))(x), jax.vmap(jax.grad(f))(x), 1e-12)
+        close(jax.hessian(g)(x[0]), jax.hessian(f)(x[0]), 1e-11)
+        loop = [lax.fori_loop(0, 3, lambda i, y, f=f: y * f(y), x[0]) for f in (f, g)]
+        close(*loop, 1e-10)
+
+
+def operations(function, *arguments):
+    """Arithmetic that the scalarized function's outputs need, without what moves numbers about."""
+    jaxpr = jax.make_jaxpr(scalarized(function))(*arguments).jaxpr
+    moves = {"slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim"}
+    live = (e.primitive.name for e, _ in scalar._live(jaxpr, [True] * len(jaxpr.outvars)))
+    return sorted(name for name in live if name not in moves)
+
+
+@pytest.mark.parametrize(
+    ("function", "wanted"),
+    [
+        (lambda x: np.array([0.0, 1.0, -1.0]) * x, ["neg"]),
+        (lambda x: x + np.zeros(3) - np.zeros(3), []),
+        (lambda x: 0.0 - jnp.negative(x), []),
+        (lambda x: -jnp.negative(x), []),
+        (lambda x: (0.0 / x)[0] + x[0] / 1.0, []),
+        (lambda x: x[0] + (-x[1]), ["sub"]),
+        (lambda x: x - x, []),
+        (lambda x: jnp.sin(x[0]) + jnp.sin(x[::-1])[2], ["add", "sin"]),
+        (lambda x: x[0] * x[1] - x[1] * x[0], []),
+        (lambda x: jnp.where(x > np.inf, x, x), []),
+        (lambda x: np.diag([2.0, 0.0, 1.0]) @ x, ["mul"]),
+        (lambda x: jnp.sin(np.ones(3)) * 2.0, []),
+        (lambda x: x[jnp.argsort(np.array([3, 1, 2]))], []),  # known: computed here and now
+        (lambda x: (x * np.array([1.0, 2.0, 3.0]))[:1], []),
+    ],
+)
+def test_pruned_and_shared(function, wanted, strictly):
+    assert operations(function, jnp.ones(3)) == wanted
+    close(scalarized(function)(jnp.arange(1.0, 4.0)), function(jnp.arange(1.0, 4.0)), 1e-6)
+
+
+def test_zero_times_infinity_is_zero_here():
+    x = jnp.array([np.inf, np.nan])
+    assert np.isnan(0.0 * x).all()
+    np.testing.assert_array_equal(jax.jit(scalarized(lambda x: 0.0 * x))(x), 0.0)
+    assert not np.isfinite(scalarized(lambda x: 2.0 * x)(x)).any()
+
+
+@jax.custom_jvp
+def bent(x):
+    return x**2
+
+
+bent.defjvp(lambda primals, tangents: (bent(*primals), 5.0 * tangents[0]))
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        jnp.sort,
+        bent,
+        lambda x: x[jnp.argmax(x)],
+        lambda x: lax.while_loop(lambda x: x[0] < 9.0, lambda x: 2.0 * x, x),
+        lambda x: x + jax.random.normal(jax.random.key(3), (3,)) * jnp.linalg.det(jnp.diag(x)),
+        lambda x: jnp.cumsum(jnp.sin(jnp.outer(jnp.arange(5000.0), x))),
+    ],
+)
+def test_what_is_not_supported_is_left_as_it_is(function):
+    x = jnp.array([2.0, 3.0, 1.0])
+    close(jax.jit(scalarized(function))(x), jax.jit(function)(x), 1e-6)
+    derivative = jax.jacfwd(function)
+    close(jax.jit(jax.jacfwd(scalarized(function)))(x), jax.jit(derivative)(x), 1e-6)
+
+
+def test_keys_pass_through():
+    def f(key, x):
+        return jax.random.normal(key, (2,)) + x
+
+    close(scalarized(f)(jax.random.key(0), 1.0), f(jax.random.key(0), 1.0), 0)
+
+
+EVERYTHING = """
+<mujoco model="everything">
+  <option timestep="0.01" gravity="1 -2 -9"><flag contact="disable"/></option>
+  <worldbody>
+    <body pos="0 0.1 1" euler="10 20 30">
+      <joint name="rail" type="slide" axis="1 0 0.5" damping="0.3" stiffness="2" springref="0.2"/>
+      <geom type="box" size="0.1 0.2 0.3" pos="0.05 0.02 0.01"/>
+      <body pos="0.3 0 0.1">
+        <joint name="arm" axis="0 1 0.2" pos="0.01 0 0.02" armature="0.1" damping="0.2"/>
+        <inertial pos="0.2 0.05 0.01" mass="0.7" fullinertia="0.02 0.03 0.04 0.001 0.002 0.003"/>
+        <body pos="0 0 0.4" quat="0.9 0.1 0.3 0.2">
+          <joint name="wrist" axis="1 1 1" stiffness="1"/>
+          <geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="rail" gear="3"/>
+    <position joint="arm" kp="5" kv="1"/>
+    <general joint="wrist" dyntype="filter" dynprm="0.1" gainprm="2"/>
+  </actuator>
+</mujoco>"""
+
+
+def chain(links):
+    body = "".join(
+        f'<body pos="0 0 {-0.5 * (i > 0)}"><joint name="j{i}" axis="0 1 0" damping="0.1"/>'
+        '<geom type="capsule" size="0.04" fromto="0 0 0 0 0 -0.5"/>'
+        for i in range(links)
+    )
+    return (
+        '<mujoco><option timestep="0.01"><flag contact="disable"/></option>'
+        f"<worldbody>{body}{'</body>' * links}</worldbody>"
+        '<actuator><motor joint="j0"/><motor joint="j1" gear="2"/></actuator></mujoco>'
+    )
+
+
+def task(model):
+    model = path(model) if model in ("pendulum", "cartpole", "acrobot") else model
+    return from_mjcf(model, horizon=0.02, dt=0.01, running_residual=lambda data, u: u)
+
+
+MODELS = {
+    **{name: name for name in ("pendulum", "cartpole", "acrobot")},
+    "chain": chain(5),
+    "everything": EVERYTHING,
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_steps_and_jacobians_are_those_of_mjx(model, monkeypatch):
+    with jax.enable_x64(True):
+        dynamics = task(MODELS[model]).dynamics
+        n, nx = dynamics.nx + dynamics.nu, dynamics.nx
+        z = jnp.asarray(RNG.uniform(-1.0, 1.0, n))
+
+        def derivatives(by, dynamics, z):
+            def f(dz):
+                return dynamics.step(*jnp.split(z + dz, [nx]))
+
+            return by.jacobian(f, n, jax.random.key(0))
+
+        def all_of_it(by, z, dynamics):
+            return jax.jit(lambda dynamics, z: derivatives(by, dynamics, z))(dynamics, z)
+
+        seen = all_of_it(InScalars(Autodiff()), z, dynamics)
+        monkeypatch.setattr(mjcf, "scalarized", lambda function, limit: function)
+        jax.clear_caches()
+        close(seen, all_of_it(Autodiff(), z, dynamics), 1e-12)
+
+
+def test_a_cart_pole_is_a_few_hundred_operations(strictly):
+    dynamics = task("cartpole").dynamics
+    x, u = jnp.zeros(4), jnp.zeros(1)
+
+    def f(dynamics, x, u):
+        return InScalars(Autodiff()).jacobian(
+            lambda dz: dynamics.step(x + dz[:4], u + dz[4:]), 5, jax.random.key(0)
+        )
+
+    jaxpr = jax.make_jaxpr(f)(dynamics, x, u)
+    live = scalar._live(jaxpr.jaxpr, [True, True])
+    moves = ("slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim")
+    assert sum(e.primitive.name not in moves for e, _ in live) < 600
+
+
+def after(dynamics):
+    return np.asarray(dynamics.step(jnp.array([0.3, 0.2]), jnp.array([0.1])))
+
+
+def test_a_number_that_was_zero_is_seen_when_it_changes():
+    dynamics = task("pendulum").dynamics
+    model = dynamics.model
+    assert np.asarray(model.opt.gravity)[0] == 0
+    assert np.asarray(model.dof_armature)[0] == 0
+    for change in (
+        {"dof_armature": model.dof_armature + 1.0},
+        {"opt": model.opt.replace(gravity=jnp.array([5.0, 0.0, -9.81]))},
+        {"jnt_axis": jnp.array([[0.0, -0.8, 0.6]])},
+    ):
+        other = replace(dynamics, model=model.replace(**change))
+        assert other.structure != dynamics.structure
+        assert np.abs(after(other) - after(dynamics)).max() > 1e-4, change
+        # and inside of a compiled function, where the numbers themselves are not known
+        seen = jax.jit(lambda change: after_of(dynamics, change))(change)
+        np.testing.assert_allclose(seen, after(other), rtol=1e-5)
+
+
+def after_of(dynamics, change):
+    other = replace(dynamics, model=dynamics.model.replace(**change))
+    return other.step(jnp.array([0.3, 0.2]), jnp.array([0.1]))
+
+
+def test_other_numbers_have_the_same_structure():
+    dynamics = task("pendulum").dynamics
+    model = dynamics.model
+    heavy = replace(dynamics, model=model.replace(body_mass=2.0 * model.body_mass))
+    assert heavy.structure == dynamics.structure
+    before, _ = after(dynamics), mjcf._step._cache_size()
+    size = mjcf._step._cache_size()
+    assert np.abs(after(heavy) - before).max() > 1e-4
+    assert mjcf._step._cache_size() == size
+
+
+def test_dynamics_survive_as_a_pytree():
+    dynamics = task("pendulum").dynamics
+    leaves, tree = jax.tree.flatten(dynamics)
+    again = jax.tree.unflatten(tree, leaves)
+    assert again.structure == dynamics.structure
+    assert (again.dt, again.substeps) == (dynamics.dt, dynamics.substeps)
+    many = jax.tree.map(lambda a: jnp.stack([jnp.asarray(a)] * 2), dynamics)
+    x, u = jnp.array([0.3, 0.2]), jnp.array([0.1])
+    seen = jax.vmap(lambda dynamics: dynamics.step(x, u))(many)
+    np.testing.assert_allclose(seen, [after(dynamics)] * 2, rtol=1e-6)
