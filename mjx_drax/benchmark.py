@@ -2,7 +2,8 @@
 
     cpu     every task with its own settings and number of chains; then one pendulum on one CPU
             thread, 1 to 16 chains against IPOPT in the same process
-    gpu     as many chains as suit a GPU; then 16,384 pendulums with initial states of their own
+    gpu     as many chains as suit a GPU, and ablations with the first seed; then 16,384 pendulums
+            with initial states of their own
     peers   this solver, its ablations, IPOPT and shooting methods; an equal number of evaluations
             of f for shooting as for this solver
 
@@ -49,6 +50,9 @@ GPU_CHAINS = {
     "deep_trap": 1_024,
 }
 """Tasks of the suite `gpu`, and their chains."""
+
+GPU_PROBES = 1
+"""Interrupted solves for one row of the suite `gpu`: its replays take longer than its solves."""
 
 PEER_TASKS = ("pendulum", "bug_trap", "deep_trap", "cartpole_swingup", "acrobot_swingup")
 """Tasks of the suite `peers`; IPOPT and the ablations on those that are functions."""
@@ -131,7 +135,11 @@ def _gpu(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iter
     for name in names:
         problem, solver, _ = _task(name)
         for seed in seeds:
-            yield ours(problem, solver, chains or GPU_CHAINS[name], seed)
+            yield ours(problem, solver, chains or GPU_CHAINS[name], seed, probes=GPU_PROBES)
+        if name in FUNCTIONS:
+            for label, changed in ablations(problem, solver).items():
+                number = chains or GPU_CHAINS[name]
+                yield ours(problem, changed, number, seeds[0], f"{OURS}, {label}", probes=0)
     if "pendulum" in names:
         yield from _random_pendulums(chains or GPU_CHAINS["pendulum"], seeds)
 

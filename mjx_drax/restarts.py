@@ -68,7 +68,7 @@ class Restarts:
             iterations=150,
             tail=60,
             noise=Geometric(6.0, 1.5e-3),
-            penalty=Geometric(30.0, 3e3),
+            penalty=Geometric(40.0, 4e3),
             damping=Geometric(0.3, 0.1, 0.03),
             barrier_weight=Geometric(0.1, 1e-3, 1e-5),
         )
@@ -198,6 +198,8 @@ class _Search:
     def run(self, solver: Restarts) -> Run:
         clock = time.perf_counter()
         flow, total = solver.flow, solver.iterations
+        if solver.descent is not None:
+            flow = replace(flow, scale=_scale(1.0, 1.0))  # not yet known, but of that type
         state, info = self._start(flow, 0)
         _require_finite(self.problem, info)
         unit = unit_of(np.asarray(info.cost))

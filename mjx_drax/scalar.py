@@ -57,7 +57,7 @@ def scalarized(function: Callable[..., Any], limit: int = LIMIT) -> Callable[...
         flat = jax.tree.leaves(arguments)
         try:
             outputs = _Evaluation(limit).outputs(closed, flat)
-        except Unsupported:
+        except (Unsupported, TypeError):  # types: constants that jax kept from another precision
             outputs = jaxpr_as_fun(closed)(*flat)
         return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
 
@@ -706,7 +706,8 @@ def _closed(ev: _Evaluation, closed: ClosedJaxpr, arguments: Sequence[Any]) -> l
 
 
 def _scan(ev: _Evaluation, values: list[np.ndarray], params: dict[str, Any]) -> list[np.ndarray]:
-    n, carried, length = params["num_consts"], params["num_carry"], params["length"]
+    n, carried = _counts(params)
+    length = params["length"]
     fixed, carry, over = values[:n], values[n : n + carried], values[n + carried :]
     rows: list[Any] = [None] * length
     for i in range(length)[:: -1 if params["reverse"] else 1]:
@@ -720,6 +721,14 @@ def _scan(ev: _Evaluation, values: list[np.ndarray], params: dict[str, Any]) -> 
         for column, aval in zip(zip(*rows, strict=True), avals, strict=True)
     ]
     return [*carry, *stacked]
+
+
+def _counts(params: dict[str, Any]) -> tuple[int, int]:
+    """How many of a scan's operands are fixed, and how many are carried."""
+    if "ft_in" in params:  # since jax 0.11
+        fixed, carry, _ = params["ft_in"].unpack()
+        return len(fixed), len(carry)
+    return params["num_consts"], params["num_carry"]
 
 
 def _while(ev: _Evaluation, values: list[np.ndarray], params: dict[str, Any]) -> list[Any]:
