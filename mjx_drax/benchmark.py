@@ -139,7 +139,7 @@ def _gpu(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iter
         if name in FUNCTIONS:
             for label, changed in ablations(problem, solver).items():
                 number = chains or GPU_CHAINS[name]
-                yield ours(problem, changed, number, seeds[0], f"{OURS}, {label}", probes=0)
+                yield ours(problem, changed, number, seeds[0], label, probes=0)
     if "pendulum" in names:
         yield from _random_pendulums(chains or GPU_CHAINS["pendulum"], seeds)
 
@@ -269,7 +269,7 @@ def line(row: Row) -> str:
 
     return (
         f"| {row['problem']} | {row['horizon']} | {row['solver']} | {row['seed']} "
-        f"| {row['chains']} | {cell('success_rate', '.1%')} | {cell('near_rate', '.1%')} "
+        f"| {row['chains']} | {cell('success_rate', '.2%')} | {cell('near_rate', '.1%')} "
         f"| {cell('best_cost', '.6g')} "
         f"| {cell('cost_ratio', '.4f')} | {cell('max_defect', '.0e')} "
         f"| {cell('evaluations', '.2g')} | {cell('time_to_certified_s', '.3g')} "

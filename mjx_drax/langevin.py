@@ -257,8 +257,11 @@ class Langevin:
                 memory,
             )
 
+        present = state.multipliers
+        if not tail:  # bounds have multipliers of their own in the tail only
+            present = replace(present, bounds=None)
         directions = jax.vmap(direction)(
-            state.trajectory, state.multipliers, state.damping, state.key, state.memory
+            state.trajectory, present, state.damping, state.key, state.memory
         )
 
         def diffuse(state: State) -> tuple[Trajectory, Array]:
@@ -310,31 +313,46 @@ class Langevin:
             trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
         else:
             trajectory, size = diffuse(state)
-        factor = jnp.where(size >= 1.0, EASE, jnp.where(size < SHORT, TIGHTEN, 1.0))
-        adapted = jnp.clip(factor * state.damping, *DAMPING)
-        if self.preconditioner.multipliers_step_alone:
-            size = jnp.ones_like(size)
+        rate_size = jnp.ones_like(size) if self.preconditioner.multipliers_step_alone else size
         multipliers = jax.tree.map(
-            lambda m, rate: m + _per_chain(size, m) * rate,
+            lambda m, rate: m + _per_chain(rate_size, m) * rate,
             replace(state.multipliers, bounds=None),
             directions.multipliers,
-        )
-        follow = jax.vmap(self.bounds.follow, in_axes=(None, 0, 0, 0, None, 0))
-        old: Trajectory = state.trajectory
-        of_bounds: Any = state.multipliers.bounds
-        followed = follow(problem.bounds, old, trajectory, of_bounds, levels.barrier, size)
-        of_bounds = jax.tree.map(
-            partial(jnp.where, noisy), self._central(problem, trajectory, levels), followed
         )
         new = replace(
             state,
             trajectory=trajectory,
-            multipliers=replace(multipliers, bounds=of_bounds),
-            damping=jnp.where(noisy, state.damping, adapted),
+            multipliers=replace(multipliers, bounds=state.multipliers.bounds),
             gains=directions.gains,
             memory=directions.memory,
         )
+        if tail:
+            new = self._adapted(problem, state, new, size, levels, noisy)
         return _keep_finite(state, new, iteration)
+
+    def _adapted(
+        self,
+        problem: Problem,
+        old: State,
+        new: State,
+        size: Array,
+        levels: Levels,
+        noisy: Array,
+    ) -> State:
+        """`new` with the damping and the bounds' multipliers that a tail's iteration leaves."""
+        factor = jnp.where(size >= 1.0, EASE, jnp.where(size < SHORT, TIGHTEN, 1.0))
+        damping = jnp.clip(factor * old.damping, *DAMPING)
+        follow = jax.vmap(self.bounds.follow, in_axes=(None, 0, 0, 0, None, 0))
+        of_bounds: Any = old.multipliers.bounds
+        knots: tuple[Trajectory, Trajectory] = (old.trajectory, new.trajectory)
+        followed = follow(problem.bounds, *knots, of_bounds, levels.barrier, size)
+        central = self._central(problem, new.trajectory, levels)
+        of_bounds = jax.tree.map(partial(jnp.where, noisy), central, followed)
+        return replace(
+            new,
+            multipliers=replace(new.multipliers, bounds=of_bounds),
+            damping=jnp.where(noisy, old.damping, damping),
+        )
 
     def _central(self, problem: Problem, trajectory: Trajectory, levels: Levels) -> Sides:
         """The bounds' multipliers of every chain, on the central path."""
@@ -396,9 +414,11 @@ def _keep_finite(old: State, new: State, iteration: Array) -> State:
     """The new state, where chains that would turn non-finite stay what they were."""
     names = ("trajectory", "multipliers", "damping", "gains", "memory")
     before, after = ({name: getattr(state, name) for name in names} for state in (old, new))
-    finite = jnp.stack(
-        [jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim))) for a in jax.tree.leaves(after)]
-    ).all(0)
+    pairs = zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True)
+    moved = [a for a, b in pairs if a is not b]
+    finite = jnp.stack([jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim))) for a in moved]).all(
+        0
+    )
     alive = old.alive & finite
     kept = jax.tree.map(lambda a, b: jnp.where(_per_chain(alive, a), a, b), after, before)
     died_at = jnp.where(old.alive & ~finite, iteration, old.died_at)
