@@ -391,7 +391,8 @@ _NUMPY: dict[str, Callable[..., Any]] = {
 _ELEMENTWISE = {
     *_NUMPY,
     *("acosh", "asinh", "atanh", "cbrt", "cosh", "erf", "erf_inv", "exp2", "expm1", "integer_pow"),
-    *("log1p", "logistic", "nextafter", "pow", "reduce_precision", "round", "rsqrt", "sinh"),
+    *("log1p", "logistic", "nextafter", "one_minus_square", "pow", "reduce_precision", "round"),
+    *("rsqrt", "sinh"),
 }
 
 
