@@ -215,13 +215,16 @@ def test_random_states_are_the_same_however_many():
     assert 3.9 < np.abs(more).max() < 4.0
 
 
-def test_command_writes_a_list_of_rows(tmp_path, capsys):
+def test_command_writes_a_list_of_rows(tmp_path, capsys, monkeypatch):
+    fewer = {"no restarts": Restarts(attempts=1)}
+    monkeypatch.setattr(benchmark, "ablations", lambda problem, solver: fewer)
     command = "benchmark pendulum --suite gpu --seeds 0 --chains 4 --out"
     main([*command.split(), str(tmp_path)])
     rows = json.loads((tmp_path / "benchmark.json").read_text())
     assert isinstance(rows, list)
-    assert [row["problem"] for row in rows] == ["pendulum", "pendulum, random x_init"]
-    states = rows[1]
+    assert [row["problem"] for row in rows] == [*["pendulum"] * 2, "pendulum, random x_init"]
+    assert [row["solver"] for row in rows] == ["mjx_drax", "no restarts", "mjx_drax"]
+    states = rows[2]
     assert 0 <= states["share_feasible_1e-5"] <= states["share_feasible_1e-3"] <= 1
     for row in rows:
         assert set(measure.FIELDS) <= set(row)
