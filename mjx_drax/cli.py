@@ -321,6 +321,8 @@ class _Bar:
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
+            self._bar.total = self._bar.n  # fewer iterations than expected were enough
+            self._bar.refresh()
             self._bar.close()
 
 

@@ -221,8 +221,11 @@ class _Search:
                 unit = MORE * unit  # the knots' cost says too little: penalize defects more
             if solver.descent is not None:
                 flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
-            found, complete = self._attempt(flow, *self._start(flow, attempt), total)
-            kept = _best(kept, found, owners)
+            try:
+                found, complete = self._attempt(flow, *self._start(flow, attempt), total)
+                kept = _best(kept, found, owners)
+            except KeyboardInterrupt:  # between two attempts
+                break
         times = compile_time, time.perf_counter() - clock
         return Run(kept.state, kept.info, kept.converged_at, self.records, *times)
 

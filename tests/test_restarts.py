@@ -85,6 +85,21 @@ def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
     assert (cheaper & kept.feasible >= first.feasible).all()
 
 
+def test_ctrl_c_between_two_attempts_keeps_the_answers_of_the_first(monkeypatch):
+    start = restarts._Search._start
+
+    def interrupted(self, flow, attempt):
+        if attempt:
+            raise KeyboardInterrupt
+        return start(self, flow, attempt)
+
+    monkeypatch.setattr(restarts._Search, "_start", interrupted)
+    kept = run(PROGRAM, 8, 0, Restarts(SHORT))
+    monkeypatch.undo()
+    first = run(PROGRAM, 8, 0, Restarts(SHORT, attempts=1))
+    np.testing.assert_array_equal(kept.state.trajectory.u, first.state.trajectory.u)
+
+
 def attempt(costs, defects, label):
     """An attempt whose knots say which one it was, and which place."""
     n = len(costs)
