@@ -65,7 +65,7 @@ def test_step_is_newtons_and_multipliers_follow_the_predicted_defect(mu, seed):
     H, g, J = dense(model, cost)
     h, lam = model.h.ravel(), multipliers.ravel()
     d = -np.linalg.solve(H + mu * J.T @ J, g + J.T @ (lam + mu * h))
-    step = newton(model, cost, multipliers, mu, white(KEY))
+    step = jax.jit(newton)(model, cost, multipliers, mu, white(KEY))
     np.testing.assert_allclose(flat(step.dx, step.du), d, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(np.ravel(step.rate), mu * (h + J @ d), rtol=1e-7, atol=1e-5)
 
@@ -76,7 +76,7 @@ def test_float32_needs_no_digits_for_the_penalty():
     mu = 1e6  # M has a condition number far beyond 1 / eps
     d = -np.linalg.solve(H + mu * J.T @ J, g + J.T @ (multipliers.ravel() + mu * model.h.ravel()))
     single = jax.tree.map(np.float32, (model, cost, multipliers, mu))
-    step = newton(*single, white(KEY, np.float32))
+    step = jax.jit(newton)(*single, white(KEY, np.float32))
     assert step.dx.dtype == np.float32
     np.testing.assert_allclose(flat(step.dx, step.du), d, rtol=1e-3, atol=1e-3 * np.abs(d).max())
 
@@ -104,7 +104,8 @@ def test_sampled_noise_is_white_in_the_metric():
     H, _, J = dense(model, cost)
     mu, samples = 10.0, 20_000
     drawn_white = jax.vmap(white)(jax.random.split(KEY, samples))
-    step = jax.vmap(newton, (None, None, None, None, 0))(model, cost, multipliers, mu, drawn_white)
+    over_noise = jax.jit(jax.vmap(newton, (None, None, None, None, 0)))
+    step = over_noise(model, cost, multipliers, mu, drawn_white)
     n = np.hstack([step.nx.reshape(samples, -1), step.nu.reshape(samples, -1)])
     whitened = n @ np.linalg.cholesky(H + mu * J.T @ J)  # L'n ~ N(0, I) for M = L L'
     np.testing.assert_allclose(whitened.mean(0), 0, atol=6 / samples**0.5)
@@ -123,7 +124,7 @@ def batch(chains, dtype):
 
 def test_kernel_agrees_with_the_plain_recursion():
     arguments = batch(37, np.float64)  # one warp, and another that is not full
-    plain = jax.vmap(newton)(*arguments)
+    plain = jax.jit(jax.vmap(newton))(*arguments)
     kernel = newton_batch(*arguments, interpret=True)
     for name in ("dx", "du", "nx", "nu", "rate", "K"):
         np.testing.assert_allclose(
@@ -142,16 +143,19 @@ def test_maps_may_be_nested_and_arguments_shared():
     cost = jax.tree.map(lambda a: a[0], cost)
 
     def alone(i):
-        own, numbers_ = jax.tree.map(lambda a: a[i], (model, numbers))
-        return newton(own, cost, multipliers[i], mu[0], numbers_)
+        own, own_numbers = jax.tree.map(lambda a: a[i], (model, numbers))
+        return one(own, cost, multipliers[i], mu[0], own_numbers)
 
+    one = jax.jit(newton)
+    steps = [alone(i) for i in range(6)]
     fold = jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), (model, multipliers, numbers))
     inner = jax.vmap(newton, (0, None, 0, None, 0))
-    nested = jax.vmap(inner, (0, None, 0, None, 0))(fold[0], cost, fold[1], mu[0], fold[2])
+    nested = jax.jit(jax.vmap(inner, (0, None, 0, None, 0)))(fold[0], cost, fold[1], mu[0], fold[2])
     for name in ("dx", "rate", "K"):
-        flat_ = getattr(nested, name).reshape(6, *getattr(nested, name).shape[2:])
-        expected = np.stack([getattr(alone(i), name) for i in range(6)])
-        np.testing.assert_allclose(flat_, expected, rtol=1e-9, atol=1e-9)
+        expected = np.stack([getattr(step, name) for step in steps])
+        np.testing.assert_allclose(
+            getattr(nested, name).reshape(expected.shape), expected, rtol=1e-9, atol=1e-9
+        )
 
 
 def lqr(A, B, cost):
