@@ -11,6 +11,7 @@ from mjx_drax.riccati import QuadraticCost, White, factorize, newton, solve_and_
 from mjx_drax.riccati_kernel import newton_batch
 
 K, NDX, NU = 6, 3, 2
+JAX = tuple(map(int, jax.__version__.split(".")[:2]))
 KEY = jax.random.key(0)
 
 
@@ -132,7 +133,11 @@ def test_kernel_agrees_with_the_plain_recursion():
         )
 
 
-def test_kernel_lowers_for_cuda_from_any_machine():
+@pytest.mark.skipif(
+    JAX >= (0, 11),
+    reason="since jax 0.11, Triton kernels are lowered only where there is a GPU",
+)
+def test_kernel_lowers_for_cuda_without_a_gpu():
     arguments = batch(4, np.float32)
     text = jax.jit(newton_batch).trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("triton") >= 2
