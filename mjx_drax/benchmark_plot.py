@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 STYLES: dict[str, dict[str, Any]] = {
     "mjx_drax": {"color": BLUE, "lw": 2.4, "marker": "o"},
+    "no restarts": {"color": PURPLE, "ls": "-.", "marker": "d"},
     "no noise": {"color": SKY, "ls": "--", "marker": "v"},
     "no tail": {"color": SKY, "ls": ":", "marker": "^"},
     "diagonal": {"color": BLUE, "ls": "--", "marker": "<"},

@@ -36,18 +36,14 @@ Sides = tuple[Trajectory, Trajectory]
 """Numbers of the lower and of the upper ends, shaped like the knots."""
 
 
-@register_dataclass
-@dataclass(frozen=True)
-class LogBarrier:
-    """The barrier b(z), and a fraction-to-the-boundary rule for steps.
-
-    Attributes:
-        floor: smallest slack that derivatives see, in the variable's units.
-        fraction: share of an element's slack that one step may use (fraction to the boundary).
-    """
+class _Barrier:
+    """The barrier b and its multipliers, over those ends of the box that it sees."""
 
     floor: ArrayLike = 1e-6
-    fraction: ArrayLike = 0.9
+
+    def seen(self, box: Box) -> Box:
+        """The box with the ends that have a barrier, the others infinite; slacks have theirs."""
+        return box
 
     def value(self, box: Box, trajectory: Trajectory) -> Array:
         """b(z) as one term per knot (u_k, x_{k+1}), (K,)."""
@@ -56,7 +52,7 @@ class LogBarrier:
             below, above = self._slack(z - lower), self._slack(upper - z)
             return jnp.sum(jnp.log(below) + jnp.log(above), axis=-1)
 
-        logs = jax.tree.map(log_slacks, trajectory, *box.sides(trajectory))
+        logs = jax.tree.map(log_slacks, trajectory, *self.seen(box).sides(trajectory))
         knots = logs.x + logs.u
         if logs.slack is not None:
             knots = (knots + logs.slack.stage).at[-1].add(logs.slack.terminal)
@@ -69,7 +65,7 @@ class LogBarrier:
 
         With multipliers v the curvature is v / slack; without, v = rho / slack, it is b's own.
         """
-        lower, upper = box.sides(trajectory)
+        lower, upper = self.seen(box).sides(trajectory)
         central = self.multipliers(box, trajectory, weight)
         below, above = multipliers or central
 
@@ -83,7 +79,7 @@ class LogBarrier:
 
     def multipliers(self, box: Box, trajectory: Trajectory, weight: ArrayLike) -> Sides:
         """Multipliers of the lower and the upper ends on the central path, v = rho / slack."""
-        lower, upper = box.sides(trajectory)
+        lower, upper = self.seen(box).sides(trajectory)
         return (
             jax.tree.map(lambda z, a: weight * _inverse(self._slack(z - a), a), trajectory, lower),
             jax.tree.map(lambda z, b: weight * _inverse(self._slack(b - z), b), trajectory, upper),
@@ -112,11 +108,29 @@ class LogBarrier:
             held = jnp.clip(v + step, central / FOLLOW, central * FOLLOW)
             return jnp.where(jnp.isinf(end), 0.0, held)
 
-        lower, upper = box.sides(old)
+        lower, upper = self.seen(box).sides(old)
         return (
             jax.tree.map(partial(side, sign=1.0), old, new, lower, multipliers[0]),
             jax.tree.map(partial(side, sign=-1.0), old, new, upper, multipliers[1]),
         )
+
+    def _slack(self, slack: Array) -> Array:
+        """The slack that is differentiated: floored, and 1 (log 1 = 0) where there is no bound."""
+        return jnp.where(jnp.isinf(slack), 1.0, jnp.maximum(slack, self.floor))
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class LogBarrier(_Barrier):
+    """The barrier b(z), and a fraction-to-the-boundary rule for steps.
+
+    Attributes:
+        floor: smallest slack that derivatives see, in the variable's units.
+        fraction: share of an element's slack that one step may use (fraction to the boundary).
+    """
+
+    floor: ArrayLike = 1e-6
+    fraction: ArrayLike = 0.9
 
     def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
         """`new`, each element held back so as to keep 1 - fraction of the slack it had in `old`."""
@@ -132,10 +146,6 @@ class LogBarrier:
     def interior(self, box: Box, trajectory: Trajectory, margin: float = 1e-2) -> Trajectory:
         """The nearest trajectory at least `margin` of the box's width away from its ends."""
         return _inside(box, trajectory, margin)
-
-    def _slack(self, slack: Array) -> Array:
-        """The slack that is differentiated: floored, and 1 (log 1 = 0) where there is no bound."""
-        return jnp.where(jnp.isinf(slack), 1.0, jnp.maximum(slack, self.floor))
 
 
 def _inverse(slack: Array, end: Array) -> Array:
@@ -154,57 +164,30 @@ def _inside(box: Box, trajectory: Trajectory, margin: float) -> Trajectory:
     return jax.tree.map(inside, trajectory, lower, upper)
 
 
-class _WithoutBarrier:
+class _WithoutBarrier(_Barrier):
     """What rules that only act on steps have in common: no barrier on states and controls.
 
     Slack variables keep theirs, which is what makes an inequality act before it is violated.
     """
 
-    def value(self, box: Box, trajectory: Trajectory) -> Array:
-        """b of the slack variables as one term per knot, (K,)."""
-        return LogBarrier().value(_free(box), trajectory)
-
-    def derivatives(
-        self, box: Box, trajectory: Trajectory, weight: ArrayLike, multipliers: Sides | None = None
-    ) -> tuple[Trajectory, Trajectory]:
-        """Gradient and curvature of rho b: zeros but for the slack variables."""
-        return LogBarrier().derivatives(_free(box), trajectory, weight, multipliers)
-
-    def multipliers(self, box: Box, trajectory: Trajectory, weight: ArrayLike) -> Sides:
-        """Multipliers of the slack variables' bounds; zeros for all others."""
-        return LogBarrier().multipliers(_free(box), trajectory, weight)
-
-    def follow(
-        self,
-        box: Box,
-        old: Trajectory,
-        new: Trajectory,
-        multipliers: Sides,
-        weight: ArrayLike,
-        size: ArrayLike,
-    ) -> Sides:
-        """`LogBarrier.follow` for the slack variables."""
-        return LogBarrier().follow(_free(box), old, new, multipliers, weight, size)
+    def seen(self, box: Box) -> Box:
+        """A box without ends."""
+        ends = (
+            (box.x_lower, -jnp.inf),
+            (box.x_upper, jnp.inf),
+            (box.u_lower, -jnp.inf),
+            (box.u_upper, jnp.inf),
+        )
+        return Box(*(jnp.full_like(end, value) for end, value in ends))
 
     def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
         """The nearest trajectory inside the box, ends included."""
         return _inside(box, trajectory, 0.0)
 
 
-def _free(box: Box) -> Box:
-    """A box without ends."""
-    ends = (
-        (box.x_lower, -jnp.inf),
-        (box.x_upper, jnp.inf),
-        (box.u_lower, -jnp.inf),
-        (box.u_upper, jnp.inf),
-    )
-    return Box(*(jnp.full_like(end, value) for end, value in ends))
-
-
 def _with_slack_confined(box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
     """`new`, its slack variables held by the barrier's rule."""
-    return replace(new, slack=LogBarrier().confine(_free(box), old, new).slack)
+    return replace(new, slack=LogBarrier().confine(box, old, new).slack)
 
 
 @register_dataclass

@@ -145,6 +145,11 @@ class Langevin:
     adjusted: bool = field(default=False, metadata=Static)
 
     @property
+    def flow(self) -> Langevin:
+        """The settings of an attempt, as `Restarts` has them: these."""
+        return self
+
+    @property
     def noise_ends(self) -> list[int]:
         """After how many iterations the noise ends."""
         return [int(self.iterations)]

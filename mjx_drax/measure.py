@@ -198,10 +198,8 @@ def evaluations(solver: Langevin | Restarts, problem: Problem, chains: int, iter
     """
     dynamics = problem.dynamics
     linearization = 1 + dynamics.ndx + dynamics.nu
-    flow = solver.flow if isinstance(solver, Restarts) else solver
-    each = int(flow.iterations) + int(flow.tail)
-    attempts = -(-iterations // each) if isinstance(solver, Restarts) else 1
-    searches = attempts * int(flow.tail) * len(flow.preconditioner.ladder)
+    flow, tails = solver.flow, sum(end < iterations for end in solver.noise_ends)
+    searches = tails * int(flow.tail) * len(flow.preconditioner.ladder)
     return chains * problem.horizon * (iterations * linearization + searches)
 
 

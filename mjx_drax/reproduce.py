@@ -60,6 +60,7 @@ Numbers = dict[str, Any]
 
 STEP = 0.025
 
+# Preconditioned settings for one attempt, chosen by hand for each problem
 PENDULUM = Langevin(
     iterations=150,
     tail=50,
@@ -77,9 +78,6 @@ TRAP = Langevin(
     damping=Geometric(10.0, 0.1, 1e-3),
     barrier_weight=Geometric(0.1, 1e-3, 1e-4),
 )
-
-"""Preconditioned settings for one attempt, chosen by hand for each problem."""
-
 PENDULUM_FLOW = Langevin(
     iterations=20_000,
     tail=0,

@@ -105,10 +105,8 @@ class Restarts:
         if not isinstance(self.flow, Langevin):
             raise DraxError(f"flow is {self.flow!r}: give a Langevin.")
         self.flow.check(problem)
-        for name, least in (("descent", 0), ("attempts", 1)):
-            count = getattr(self, name)
-            if name == "descent" and count is None:
-                continue
+        descent = 0 if self.descent is None else self.descent
+        for name, count, least in (("descent", descent, 0), ("attempts", self.attempts, 1)):
             if not isinstance(count, int | np.integer) or count < least:
                 raise DraxError(f"{name} is {count!r}: give a whole number of at least {least}.")
         for name in ("within", "enough"):
@@ -119,9 +117,8 @@ class Restarts:
 
 def with_iterations(solver: Langevin | Restarts, iterations: int) -> Langevin | Restarts:
     """The same settings with other numbers of iterations, in proportion to those with noise."""
-    flow = solver.flow if isinstance(solver, Restarts) else solver
-    share = iterations / max(flow.iterations, 1)
-    flow = replace(flow, iterations=iterations, tail=round(share * flow.tail))
+    share = iterations / max(solver.flow.iterations, 1)
+    flow = replace(solver.flow, iterations=iterations, tail=round(share * solver.flow.tail))
     if isinstance(solver, Langevin):
         return flow
     descent = None if solver.descent is None else round(share * solver.descent)

@@ -125,11 +125,11 @@ class Layout:
 
     def pack(self, **arrays: Array) -> Array:
         """Arrays (chains, ..., *shape) as one (..., size, chains)."""
-        flat = [
+        parts = [
             jnp.reshape(arrays[name], (*arrays[name].shape[: -len(shape)], prod(shape)))
             for name, shape in self.shapes.items()
         ]
-        return jnp.moveaxis(jnp.concatenate(flat, axis=-1), 0, -1)
+        return jnp.moveaxis(jnp.concatenate(parts, axis=-1), 0, -1)
 
     def unpack(self, packed: Array, name: str) -> Array:
         """The array (chains, ..., *shape) called `name`."""
@@ -259,7 +259,8 @@ def forward(
     out_ref: Any,
 ) -> None:
     """`riccati.solve_and_sample` for THREADS chains."""
-    mu = read(end_ref, end)["penalty"][0]
+    last = read(end_ref, end)
+    mu = last["penalty"][0]
 
     def stage(k: Array, carry: Any) -> Any:
         dx, nx = carry
@@ -281,7 +282,7 @@ def forward(
         write(out_ref, k, flat(dx, du, nx, nu, rate))
         return dx, nx
 
-    zero = [jnp.zeros_like(mu)] * len(read(end_ref, end)["gx"])
+    zero = [jnp.zeros_like(mu)] * len(last["gx"])
     jax.lax.fori_loop(0, horizon, stage, (zero, zero))
 
 

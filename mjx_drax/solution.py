@@ -244,7 +244,7 @@ def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Ru
     state, records = run.state, run.records
     trajectories = jax.tree.map(np.asarray, state.trajectory)
     gains = np.asarray(state.gains)
-    flow = solver.flow if isinstance(solver, Restarts) else solver
+    flow = solver.flow
     if not isinstance(flow.preconditioner, GaussNewton):  # the others bring no gains
         gains = np.asarray(feedback_gains(flow, problem, state))
     info = run.info

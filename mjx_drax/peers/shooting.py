@@ -7,8 +7,8 @@ keeps a mean m and a spread s, (K, nu) each. An iteration draws N sequences
 
 rolls them out from x_init, and lets the method move m and s by what they cost. The correlation r
 between neighbouring knots makes smooth controls (r = 0: white noise); e_0 = 0 tries the mean
-itself. The cheapest rollout seen is the answer: a rollout has no defects. Bounds on states are not
-imposed, which is in favour of these methods.
+itself. The cheapest rollout seen is the answer: a rollout has no defects. Leaving the bounds on
+states is penalized (`WALL`), because without that a way out of the world is the cheapest.
 """
 
 from __future__ import annotations
