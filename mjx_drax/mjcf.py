@@ -320,6 +320,7 @@ def from_mjcf(
     u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    contacts: bool = True,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
     name: str | None = None,
@@ -349,6 +350,8 @@ def from_mjcf(
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and +-5 (rad/s or m/s) for velocities about x_init.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
+        contacts: False plans as if nothing could touch, which is right where constraints keep
+            things apart. The C engine that certifies keeps its contacts.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
         guess: guess(key) -> Trajectory, instead of the scatter boxes.
         name: used in files and tables; by default the model's name.
@@ -358,10 +361,10 @@ def from_mjcf(
     """
     host = load(model)
     name = name or str(_model_name(host))
-    _refuse_unsupported(host, name)
+    _refuse_unsupported(host, name, contacts)
     substeps = _substeps(host, dt)
     dynamics = MjxDynamics(
-        _on_device(host), substeps * host.opt.timestep, HostModel(host), substeps
+        _on_device(host, contacts), substeps * host.opt.timestep, HostModel(host), substeps
     )
     if x_init is None:
         x_init = _default_state(host)
@@ -448,16 +451,19 @@ def _bounds(
     )
 
 
-def _on_device(model: mujoco.MjModel) -> mjx.Model:
-    """The MJX model, without joint limit constraints.
+def _on_device(model: mujoco.MjModel, contacts: bool) -> mjx.Model:
+    """The MJX model, without joint limit constraints, and without contacts if asked to.
 
     Knots are bounded by the joint ranges, and inside them the C engine's limit forces are zero:
     leaving the constraint rows out changes nothing at the knots and spares a solver in f. The C
     engine keeps its limits, and the certificate would show a difference.
     """
     flags = model.opt.disableflags
+    without = mujoco.mjtDisableBit.mjDSBL_LIMIT
+    if not contacts:
+        without |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     try:
-        model.opt.disableflags = flags | mujoco.mjtDisableBit.mjDSBL_LIMIT
+        model.opt.disableflags = flags | without
         on_device = mjx.put_model(model, impl="jax")
     except (NotImplementedError, ValueError) as error:
         raise DraxError(f"MJX does not support this model: {error}") from error
@@ -468,7 +474,7 @@ def _on_device(model: mujoco.MjModel) -> mjx.Model:
     return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device)
 
 
-def _refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
+def _refuse_unsupported(model: mujoco.MjModel, name: str, contacts: bool) -> None:
     """Raise a DraxError that names the first element this version cannot plan for."""
     for j in range(model.njnt):
         kind = mujoco.mjtJoint(model.jnt_type[j])
@@ -500,7 +506,7 @@ def _refuse_unsupported(model: mujoco.MjModel, name: str) -> None:
             f"{name} has joint limits with a margin, whose forces act inside the range: not "
             "supported yet. Set margin to 0."
         )
-    pair = _contact_pair(model)
+    pair = _contact_pair(model) if contacts else None
     if pair is not None:
         raise DraxError(
             f"geoms {pair[0]!r} and {pair[1]!r} of {name} can touch: contacts are not supported "
