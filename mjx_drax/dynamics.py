@@ -48,6 +48,17 @@ class Dynamics:
         """x + dx: the state (nx,) reached from x (nx,) along the tangent vector dx (ndx,)."""
         return x + dx
 
+    def valid(self, x: Array) -> Array:
+        """The state next to numbers (..., nx) that need not be one, as random numbers are not."""
+        return x
+
+    def tangent(self, numbers: Array) -> Array:
+        """Of numbers for the entries of a state (..., nx), those for its tangent (..., ndx).
+
+        Bounds are on entries of states; their forces act in tangent space.
+        """
+        return numbers
+
     def observe(self, x: Array, u: Array) -> Any:
         """What cost functions receive for the knot (x, u): here the state itself."""
         return x

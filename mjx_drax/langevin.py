@@ -41,6 +41,7 @@ from mjx_drax.precondition import (
     Levels,
     Multipliers,
     augmented_lagrangian,
+    displaced,
 )
 from mjx_drax.problem import Problem, Stagewise, Trajectory
 from mjx_drax.quasi_newton import LBFGS
@@ -184,6 +185,11 @@ class Langevin:
                 f"adjusted=True with {type(self.preconditioner).__name__} and {constrained} "
                 "inequalities: Metropolis adjustment needs Identity() and no inequalities."
             )
+        if self.adjusted and problem.dynamics.nx != problem.dynamics.ndx:
+            raise DraxError(
+                f"adjusted=True, but states of {problem.name} hold quaternions: Metropolis "
+                "adjustment needs a vector space."
+            )
 
     def levels(self, t: ArrayLike) -> Levels:
         """The schedules' values at progress t in [0, 2]."""
@@ -297,19 +303,17 @@ class Langevin:
                 def merit(z: Trajectory) -> Array:
                     return augmented_lagrangian(problem, self.bounds, z, multipliers, levels)
 
-                now = merit(old)
-
                 def attempt(size: Array) -> tuple[Array, Trajectory]:
                     change = jax.tree.map(lambda d: size * d, to.drift)
                     new = self._moved(problem, old, change)
-                    gain = jnp.sum(merit(new) - now)
-                    worst = jnp.finfo(gain.dtype).max  # standing still: if nothing else is finite
-                    gain = jnp.where(size > 0.0, gain, worst)
-                    return jnp.where(jnp.isfinite(gain), gain, jnp.inf), new
+                    return merit(new), new
 
                 sizes = jnp.asarray(self.preconditioner.ladder, old.x.dtype)
-                gains, candidates = jax.vmap(attempt)(sizes)
-                best = jnp.argmin(gains)
+                merits, candidates = jax.vmap(attempt)(sizes)
+                gains = jnp.sum(merits - merits[-1], axis=1)  # the last one stands still
+                worst = jnp.finfo(gains.dtype).max  # which it does if nothing else is finite
+                gains = jnp.where(sizes > 0.0, gains, worst)
+                best = jnp.argmin(jnp.where(jnp.isfinite(gains), gains, jnp.inf))
                 return jax.tree.map(lambda z: z[best], candidates), sizes[best]
 
             return jax.vmap(search)(state.trajectory, state.multipliers, directions)
@@ -392,9 +396,7 @@ class Langevin:
 
     def _moved(self, problem: Problem, old: Trajectory, change: Trajectory) -> Trajectory:
         """The knots `old` moved along a tangent `change`, kept inside the bounds."""
-        x = jax.vmap(problem.dynamics.integrate)(old.x, change.x)
-        slack = jax.tree.map(jnp.add, old.slack, change.slack)
-        return self.bounds.confine(problem.bounds, old, Trajectory(x, old.u + change.u, slack))
+        return self.bounds.confine(problem.bounds, old, displaced(problem, old, change))
 
 
 def _with_slack(problem: Problem, trajectory: Trajectory) -> Trajectory:

@@ -1,11 +1,16 @@
 """Dense factorizations of the small blocks that a stage brings (sizes ndx and nu).
 
 Inside a batched scan an unrolled Cholesky beats the library's batched call many times over at
-sizes up to 8 (3 to 22 times on CPU); above that the library wins and is called.
+sizes up to 8 (3 to 22 times on CPU). Above that, GPUs call the library. CPUs run a loop over
+columns: it is about as fast as LAPACK, and two batches of LAPACK calls that run at the same time
+can wait for each other forever in jaxlib's thread pool (0.10, on two cores, nearly always).
 """
 
 from __future__ import annotations
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
@@ -19,7 +24,9 @@ def cholesky(matrix: Array) -> Array:
     if n == 0:
         return matrix
     if n > UNROLLED_UP_TO:
-        return jnp.linalg.cholesky(matrix)
+        return jax.lax.platform_dependent(
+            matrix, cpu=_cholesky_by_columns, default=jnp.linalg.cholesky
+        )
     rows: list[list[Array]] = []
     zero = jnp.zeros_like(matrix[0, 0])
     for i in range(n):
@@ -33,13 +40,45 @@ def cholesky(matrix: Array) -> Array:
     return jnp.stack([jnp.stack(row + [zero] * (n - len(row))) for row in rows])
 
 
+def _cholesky_by_columns(matrix: Array) -> Array:
+    """`cholesky` as a loop over columns."""
+    n = matrix.shape[-1]
+
+    def column(j: Array, factor: Array) -> Array:
+        below = matrix[:, j] - factor @ factor[j]
+        below = below / jnp.sqrt(below[j])
+        return factor.at[:, j].set(jnp.where(jnp.arange(n) >= j, below, 0.0))
+
+    return jax.lax.fori_loop(0, n, column, jnp.zeros_like(matrix))
+
+
+def _lower_by_rows(factor: Array, b: Array) -> Array:
+    """`solve_lower` as a loop over rows."""
+
+    def row(i: Array, out: Array) -> Array:
+        return out.at[i].set((b[i] - factor[i] @ out) / factor[i, i])
+
+    return jax.lax.fori_loop(0, len(b), row, jnp.zeros_like(b))
+
+
+def _upper_by_rows(factor: Array, b: Array) -> Array:
+    """`solve_upper` as a loop over rows, the last one first."""
+
+    def row(step: Array, out: Array) -> Array:
+        i = len(b) - 1 - step
+        return out.at[i].set((b[i] - factor[:, i] @ out) / factor[i, i])
+
+    return jax.lax.fori_loop(0, len(b), row, jnp.zeros_like(b))
+
+
 def solve_lower(factor: Array, b: Array) -> Array:
     """L^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
     n = factor.shape[-1]
     if n == 0:
         return b
     if n > UNROLLED_UP_TO:
-        return solve_triangular(factor, b, lower=True)
+        library = partial(solve_triangular, lower=True)
+        return jax.lax.platform_dependent(factor, b, cpu=_lower_by_rows, default=library)
     out: list[Array] = []
     for i in range(n):
         total = b[i]
@@ -55,7 +94,8 @@ def solve_upper(factor: Array, b: Array) -> Array:
     if n == 0:
         return b
     if n > UNROLLED_UP_TO:
-        return solve_triangular(factor, b, lower=True, trans=1)
+        library = partial(solve_triangular, lower=True, trans=1)
+        return jax.lax.platform_dependent(factor, b, cpu=_upper_by_rows, default=library)
     out: list[Array] = [b[0]] * n
     for i in reversed(range(n)):
         total = b[i]

@@ -6,7 +6,6 @@ The same model is stepped by MuJoCo's C engine, in float64, when a result is cer
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,10 +19,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from mjx_drax import physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, InScalars
 from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
+from mjx_drax.joints import Joints
+from mjx_drax.physics import mjx
 from mjx_drax.problem import (
     Aside,
     Problem,
@@ -37,10 +39,7 @@ from mjx_drax.problem import (
     vector,
 )
 from mjx_drax.scalar import scalarized
-
-with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-    from mujoco import mjx  # announces on import that warp is missing; nothing here needs warp
-
+from mjx_drax.twin import driven, twin
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
@@ -153,7 +152,7 @@ class MjxDynamics(Dynamics):
 
     @property
     def ndx(self) -> int:  # type: ignore[override]
-        """2 nv + na; equal to nx while joints are hinges and slides."""
+        """2 nv + na: one less than nx for every ball or free joint."""
         return 2 * self.model.nv + self.model.na
 
     @property
@@ -161,12 +160,33 @@ class MjxDynamics(Dynamics):
         """Number of actuators."""
         return self.model.nu
 
+    @property
+    def joints(self) -> Joints:
+        """Where quaternions stand in a state."""
+        return Joints.of(self.model)
+
+    def difference(self, x: Array, y: Array) -> Array:
+        """x - y in the tangent space at y, (ndx,)."""
+        return self.joints.difference(x, y)
+
+    def integrate(self, x: Array, dx: Array) -> Array:
+        """x + dx, (nx,)."""
+        return self.joints.integrate(x, dx)
+
+    def valid(self, x: Array) -> Array:
+        """x (..., nx) with quaternions of unit length."""
+        return self.joints.normalized(x)
+
+    def tangent(self, numbers: Array) -> Array:
+        """Of numbers (..., nx), those of the tangent (..., ndx); rotation vectors get zeros."""
+        return self.joints.tangent(numbers)
+
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u), (nx,)."""
         return _step(self.model, self.structure, self.substeps, x, u)
 
     def observe(self, x: Array, u: Array) -> mjx.Data:
-        """`mjx.Data` at the knot after `mjx.forward`: what a cost does not read is not computed."""
+        """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
         return _observe(self.model, self.structure, x, u)
 
     def differentiator(self, by: Any) -> Any:
@@ -186,10 +206,12 @@ class MjxDynamics(Dynamics):
         def chain(c: int) -> tuple[np.ndarray, np.ndarray]:
             model, data = self.mj_model, mujoco.MjData(self.mj_model)
             states, applied = np.empty(plan.shape[1:]), np.empty(u.shape[1:])
+            off = np.empty(self.ndx)
             states[0] = plan[c, 0]
             _set_state(model, data, states[0])
             for k in range(len(applied)):
-                wanted = u[c, k] + gains[c, k] @ (states[k] - plan[c, k])
+                _difference(model, states[k], plan[c, k], off)
+                wanted = u[c, k] + gains[c, k] @ off
                 applied[k] = data.ctrl[:] = np.clip(wanted, lower[k], upper[k])
                 mujoco.mj_step(model, data, self.substeps)
                 if any(data.warning[w].number for w in _BLOWN_UP):  # the engine reset itself
@@ -201,6 +223,15 @@ class MjxDynamics(Dynamics):
         with _no_log_file(), ThreadPoolExecutor(os.cpu_count()) as pool:
             runs = list(pool.map(chain, range(len(u))))
         return np.stack([run[0] for run in runs]), np.stack([run[1] for run in runs])
+
+    def deviation(self, states: np.ndarray, plan: np.ndarray) -> np.ndarray:
+        """max|x - plan| in tangent space, (...,) for states and plan of shape (..., nx)."""
+        if self.nx == self.ndx:
+            return super().deviation(states, plan)
+        off = np.empty((*states.shape[:-1], self.ndx))
+        for i in np.ndindex(states.shape[:-1]):
+            _difference(self.mj_model, states[i], plan[i], off[i])
+        return np.abs(off).max(axis=-1)
 
     def observe_replayed(self, x: np.ndarray) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
@@ -254,25 +285,28 @@ def _set_state(model: mujoco.MjModel, data: mujoco.MjData, x: np.ndarray) -> Non
     data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
 
 
-def _data(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
-    """`mjx.Data` holding a state (nx,) and a control (nu,)."""
-    qpos, qvel, act = jnp.split(x, [model.nq, model.nq + model.nv])
-    return mjx.make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
+def _difference(model: mujoco.MjModel, x: np.ndarray, plan: np.ndarray, out: np.ndarray) -> None:
+    """Write x - plan into `out` (ndx,), by the C engine's own arithmetic."""
+    nq, nv = model.nq, model.nv
+    if nq == nv:
+        np.subtract(x, plan, out)
+        return
+    mujoco.mj_differentiatePos(model, out[:nv], 1.0, plan[:nq], x[:nq])
+    np.subtract(x[nq:], plan[nq:], out[nv:])
 
 
 def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:
-    return mjx.forward(structure.imposed(model), _data(model, x, u))
+    return physics.forward(structure.imposed(model), x, u)
 
 
 def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Array) -> Array:
     def steps(model: mjx.Model, x: Array, u: Array) -> Array:
         model = structure.imposed(model)
 
-        def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            return mjx.step(model, data), None
+        def advance(x: Array, _: None) -> tuple[Array, None]:
+            return physics.step(model, x, u), None
 
-        data = jax.lax.scan(advance, _data(model, x, u), length=substeps)[0]
-        return jnp.concatenate([data.qpos, data.qvel, data.act])
+        return jax.lax.scan(advance, x, length=substeps)[0]
 
     return scalarized(steps, STEP_LIMIT)(model, x, u)
 
@@ -361,21 +395,15 @@ def from_mjcf(
     """
     host = load(model)
     name = name or str(_model_name(host))
-    _refuse_unsupported(host, name, contacts)
+    _refuse(host, name)
     substeps = _substeps(host, dt)
+    x0 = _initial_state(host, name, x_init)
+    bounded = _bounded(host, x0)
     dynamics = MjxDynamics(
-        _on_device(host, contacts), substeps * host.opt.timestep, HostModel(host), substeps
+        twin(host, contacts, bounded), substeps * host.opt.timestep, HostModel(host), substeps
     )
-    if x_init is None:
-        x_init = _default_state(host)
-    x0 = vector("x_init", x_init)
-    if x0.shape != (dynamics.nx,):
-        raise DraxError(
-            f"x_init has {x0.shape[0]} numbers; {name} has {dynamics.nx}: "
-            f"qpos ({host.nq}), qvel ({host.nv}), act ({host.na})."
-        )
     reach = np.concatenate([_joint_reach(host), np.full(host.nv, 5.0), np.ones(host.na)])
-    bounds = _bounds(host, dynamics, x_bounds, u_bounds)
+    bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
     )
@@ -386,9 +414,9 @@ def from_mjcf(
             terminal=cost_of(terminal_cost, terminal_residual),
             constraint=constraint,
             terminal_constraint=terminal_constraint,
-            x_init=x0,
+            x_init=jnp.asarray(x0),
             bounds=bounds,
-            scatter=scatter_box(bounds, x0, jnp.asarray(reach), x_scatter, u_scatter),
+            scatter=scatter_box(bounds, jnp.asarray(x0), jnp.asarray(reach), x_scatter, u_scatter),
             aside=Aside(goal, guess, name),
             horizon=knots(horizon, dynamics.dt),
         )
@@ -415,133 +443,89 @@ def _substeps(model: mujoco.MjModel, dt: float | None) -> int:
     return substeps
 
 
-def _default_state(model: mujoco.MjModel) -> np.ndarray:
-    """[qpos, qvel, act] of the first keyframe, or the default pose at rest."""
-    if model.nkey:
-        return np.concatenate([model.key_qpos[0], model.key_qvel[0], model.key_act[0]])
-    return np.concatenate([model.qpos0, np.zeros(model.nv + model.na)])
+def _refuse(model: mujoco.MjModel, name: str) -> None:
+    """Raise a DraxError for a model that no trajectory can be planned for."""
+    if model.nv == 0:
+        raise DraxError(f"{name} has no joints: there is nothing to move.")
+    if model.nu == 0:
+        raise DraxError(f"{name} has no actuators: add an <actuator>.")
+
+
+def _initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
+    """x_0 (nx,) as given, or the first keyframe, or the default pose at rest."""
+    if x_init is not None:
+        x0 = np.asarray(vector("x_init", x_init), float)
+    elif model.nkey:
+        x0 = np.concatenate([model.key_qpos[0], model.key_qvel[0], model.key_act[0]])
+    else:
+        x0 = np.concatenate([model.qpos0, np.zeros(model.nv + model.na)])
+    nx = model.nq + model.nv + model.na
+    if x0.shape != (nx,):
+        raise DraxError(
+            f"x_init has {x0.shape[0]} numbers; {name} has {nx}: "
+            f"qpos ({model.nq}), qvel ({model.nv}), act ({model.na})."
+        )
+    for q, _ in Joints.of(model).quaternions:
+        if abs(np.linalg.norm(x0[q : q + 4]) - 1.0) > 1e-3:
+            raise DraxError(
+                f"x_init holds the quaternion {x0[q : q + 4].tolist()} at {q}: "
+                "scale it to length 1."
+            )
+    mujoco.mj_normalizeQuat(model, x0[: model.nq])
+    return x0
 
 
 def _joint_reach(model: mujoco.MjModel) -> np.ndarray:
-    """Half-widths (nq,) of the scatter of joint positions: pi for hinges, 1 m for slides."""
-    hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
-    return np.where(hinge, np.pi, 1.0)
+    """Half-widths (nq,) of the scatter of positions: pi for hinges, 1 for all else."""
+    reach = np.ones(model.nq)
+    reach[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = np.pi
+    return reach
+
+
+def _bounded(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
+    """Joints whose range becomes a bound on knots, (njnt,).
+
+    Those are hinges and slides that an actuator drives and that start inside their range. What
+    rests on its limit, or starts beyond it, needs the limit's force: it stays in the dynamics.
+    """
+    kinds = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+    single = np.isin(model.jnt_type, [int(kind) for kind in kinds]) & (model.jnt_limited != 0)
+    start = x_init[model.jnt_qposadr]
+    lower, upper = _ranges(model)
+    return single & driven(model) & (start >= lower) & (start <= upper)
+
+
+def _ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
+    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
 
 
 def _bounds(
     model: mujoco.MjModel,
+    bounded: np.ndarray,
     dynamics: MjxDynamics,
     x_bounds: tuple[ArrayLike, ArrayLike] | None,
     u_bounds: tuple[ArrayLike, ArrayLike] | None,
 ) -> Any:
     """The ranges of the model's joints and controls, intersected with the user's."""
     x_lower, x_upper = np.full(dynamics.nx, -np.inf), np.full(dynamics.nx, np.inf)
-    limited = model.jnt_limited.astype(bool)
-    where = model.jnt_qposadr[limited]
-    x_lower[where], x_upper[where] = model.jnt_range[limited].T
+    where = model.jnt_qposadr[bounded]
+    x_lower[where], x_upper[where] = (end[bounded] for end in _ranges(model))
     u_lower, u_upper = np.full(model.nu, -np.inf), np.full(model.nu, np.inf)
     limited = model.actuator_ctrllimited.astype(bool)
     u_lower[limited], u_upper[limited] = model.actuator_ctrlrange[limited].T
     given = box(dynamics.nx, model.nu, x_bounds, u_bounds)
+    turning = np.flatnonzero(Joints.of(model).is_quaternion)
+    if np.isfinite(given.x_lower[..., turning]).any() or (
+        np.isfinite(given.x_upper[..., turning]).any()
+    ):
+        raise DraxError(
+            f"x_bounds are finite at entries {turning.tolist()}, which are quaternions: leave them "
+            "infinite, and bound orientations by an inequality."
+        )
     return box(
         dynamics.nx,
         model.nu,
         (np.maximum(x_lower, given.x_lower), np.minimum(x_upper, given.x_upper)),
         (np.maximum(u_lower, given.u_lower), np.minimum(u_upper, given.u_upper)),
     )
-
-
-def _on_device(model: mujoco.MjModel, contacts: bool) -> mjx.Model:
-    """The MJX model, without joint limit constraints, and without contacts if asked to.
-
-    Knots are bounded by the joint ranges, and inside them the C engine's limit forces are zero:
-    leaving the constraint rows out changes nothing at the knots and spares a solver in f. The C
-    engine keeps its limits, and the certificate would show a difference.
-    """
-    flags = model.opt.disableflags
-    without = mujoco.mjtDisableBit.mjDSBL_LIMIT
-    if not contacts:
-        without |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    try:
-        model.opt.disableflags = flags | without
-        on_device = mjx.put_model(model, impl="jax")
-    except (NotImplementedError, ValueError) as error:
-        raise DraxError(f"MJX does not support this model: {error}") from error
-    finally:
-        model.opt.disableflags = flags
-    # MJX commits its arrays to a device. What is computed from them is then committed as well, and
-    # a loop that is fed its own output would be compiled a second time.
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device)
-
-
-def _refuse_unsupported(model: mujoco.MjModel, name: str, contacts: bool) -> None:
-    """Raise a DraxError that names the first element this version cannot plan for."""
-    for j in range(model.njnt):
-        kind = mujoco.mjtJoint(model.jnt_type[j])
-        if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-            word = {mujoco.mjtJoint.mjJNT_FREE: "free", mujoco.mjtJoint.mjJNT_BALL: "ball"}[kind]
-            raise DraxError(
-                f"joint {model.joint(j).name!r} of {name} is a {word} joint: states with "
-                "quaternions are not supported yet. Use hinge and slide joints."
-            )
-    if model.nv == 0:
-        raise DraxError(f"{name} has no joints: there is nothing to move.")
-    if model.nu == 0:
-        raise DraxError(f"{name} has no actuators: add an <actuator>.")
-    if model.neq:
-        raise DraxError(
-            f"{name} has {model.neq} equality constraint(s): not supported yet. Remove them."
-        )
-    if (
-        np.any(model.tendon_limited)
-        or np.any(model.dof_frictionloss)
-        or np.any(model.tendon_frictionloss)
-    ):
-        raise DraxError(
-            f"{name} has dry friction or limited tendons: constraint forces are not supported yet. "
-            "Set frictionloss to 0 and tendons to unlimited."
-        )
-    if np.any(model.jnt_margin[model.jnt_limited.astype(bool)]):
-        raise DraxError(
-            f"{name} has joint limits with a margin, whose forces act inside the range: not "
-            "supported yet. Set margin to 0."
-        )
-    pair = _contact_pair(model) if contacts else None
-    if pair is not None:
-        raise DraxError(
-            f"geoms {pair[0]!r} and {pair[1]!r} of {name} can touch: contacts are not supported "
-            'yet. Give them contype="0" conaffinity="0", or <flag contact="disable"/>.'
-        )
-
-
-def _excluded(model: mujoco.MjModel, a: int, b: int) -> bool:
-    """Whether the bodies of two geoms are excluded from contact."""
-    low, high = sorted((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
-    return bool(np.any(model.exclude_signature == (low << 16) + high))
-
-
-def _contact_pair(model: mujoco.MjModel) -> tuple[str, str] | None:
-    """Names of the first two geoms between which MuJoCo may make a contact, or None."""
-
-    def label(g: int) -> str:
-        return model.geom(g).name or f"geom {g}"
-
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-        return None
-    if model.npair:
-        return label(model.pair_geom1[0]), label(model.pair_geom2[0])
-    parents = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
-    weld = model.body_weldid
-    for a in range(model.ngeom):
-        for b in range(a + 1, model.ngeom):
-            masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
-                model.geom_contype[b] & model.geom_conaffinity[a]
-            )
-            wa, wb = weld[model.geom_bodyid[a]], weld[model.geom_bodyid[b]]
-            if not masks or wa == wb or _excluded(model, a, b):
-                continue
-            pa, pb = (weld[model.body_parentid[w]] for w in (wa, wb))
-            if parents and wa and wb and (wa == pb or wb == pa):
-                continue
-            return label(a), label(b)
-    return None

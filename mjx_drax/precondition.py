@@ -132,9 +132,9 @@ class Identity(Memoryless):
 
     X <- X - alpha grad L_mu + sigma sqrt(2 alpha) xi,  lambda <- lambda + 2 alpha mu h.
 
-    The gradient is exact, from one reverse-mode derivative of L_mu; nothing of the Gauss-Newton
-    machinery is computed. With sampled derivatives (`derivatives=Smoothed(...)`) it is assembled
-    from J and the cost's gradient knot by knot instead.
+    The gradient is exact, from one reverse-mode derivative of L_mu in displacements of the knots;
+    nothing of the Gauss-Newton machinery is computed. With sampled derivatives
+    (`derivatives=Smoothed(...)`) it is assembled from J and the cost's gradient knot by knot.
     """
 
     derivatives: Differentiator | None = None
@@ -152,17 +152,46 @@ class Identity(Memoryless):
         """Drift, noise and multiplier rate."""
         key_noise, key_samples = jax.random.split(key)
         if self.derivatives is None:
-            slope = jax.grad(lambda z: jnp.sum(_penalized(problem, z, multipliers, levels)))(
-                trajectory
-            )
+
+            def merit(change: Trajectory) -> Array:
+                moved = displaced(problem, trajectory, change)
+                return jnp.sum(_penalized(problem, moved, multipliers, levels))
+
+            slope = jax.grad(merit)(at_rest(problem, trajectory))
         else:
             model = expand(problem, trajectory, self.derivatives, key_samples)
             slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
-        walls, _ = bounds.derivatives(problem.bounds, trajectory, levels.barrier)
+        walls, _ = _walls(problem, bounds, trajectory, levels.barrier)
         drift = jax.tree.map(lambda g, b: -(g + b), slope, walls)
         h = Multipliers(*residuals(problem, trajectory))
         rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, h)
-        return Direction(drift, _white(trajectory, key_noise), rate, _no_gains(problem))
+        return Direction(drift, _white(drift, key_noise), rate, _no_gains(problem))
+
+
+def at_rest(problem: Problem, trajectory: Trajectory) -> Trajectory:
+    """The displacement of nothing: zeros in tangent space, (K, ndx) and (K, nu)."""
+    still = jax.tree.map(jnp.zeros_like, trajectory)
+    return replace(still, x=problem.dynamics.tangent(still.x))
+
+
+def displaced(problem: Problem, trajectory: Trajectory, change: Trajectory) -> Trajectory:
+    """The knots moved along a tangent `change`."""
+    x = jax.vmap(problem.dynamics.integrate)(trajectory.x, change.x)
+    slack = jax.tree.map(jnp.add, trajectory.slack, change.slack)
+    return Trajectory(x, trajectory.u + change.u, slack)
+
+
+def _walls(
+    problem: Problem,
+    bounds: Bounds,
+    trajectory: Trajectory,
+    weight: Array,
+    multipliers: Sides | None = None,
+) -> tuple[Trajectory, Trajectory]:
+    """Gradient and curvature of the barrier, in tangent space."""
+    slope, curvature = bounds.derivatives(problem.bounds, trajectory, weight, multipliers)
+    tangent = problem.dynamics.tangent
+    return replace(slope, x=tangent(slope.x)), replace(curvature, x=tangent(curvature.x))
 
 
 def _white(trajectory: Trajectory, key: Array) -> Trajectory:
@@ -287,16 +316,14 @@ class Diagonal(Memoryless):
         key_noise, key_model = jax.random.split(key)
         model = expand(problem, trajectory, self.derivatives, key_model)
         slope = _assembled_gradient(model, trajectory, multipliers, levels.penalty)
-        walls, curvature = bounds.derivatives(
-            problem.bounds, trajectory, levels.barrier, multipliers.bounds
-        )
+        walls, curvature = _walls(problem, bounds, trajectory, levels.barrier, multipliers.bounds)
         M = jax.tree.map(
             lambda m, c: m + c + levels.damping,
             _diagonal(model, trajectory, levels.penalty),
             curvature,
         )
         drift = jax.tree.map(lambda g, b, m: -(g + b) / m, slope, walls, M)
-        noise = jax.tree.map(lambda xi, m: xi / jnp.sqrt(m), _white(trajectory, key_noise), M)
+        noise = jax.tree.map(lambda xi, m: xi / jnp.sqrt(m), _white(M, key_noise), M)
         h = Multipliers(model.dynamics.h, model.residual)
         rate = jax.tree.map(lambda c: 2.0 * levels.penalty * c, h)
         return Direction(drift, noise, rate, _no_gains(problem))
@@ -343,7 +370,7 @@ class GaussNewton(Memoryless):
         """Drift, noise and multiplier rate, from one block-tridiagonal factorization."""
         key_model, key_noise, key_slack = jax.random.split(key, 3)
         model = expand(problem, trajectory, self.derivatives, key_model)
-        walls = bounds.derivatives(problem.bounds, trajectory, levels.barrier, multipliers.bounds)
+        walls = _walls(problem, bounds, trajectory, levels.barrier, multipliers.bounds)
         cost = _with_barrier(model.cost, *walls, levels.damping)
         slope, curvature = (
             d.slack or Stagewise(jnp.zeros((problem.horizon, 0)), jnp.zeros(0)) for d in walls

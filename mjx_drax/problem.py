@@ -291,13 +291,14 @@ class Problem:
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible."""
         if self.guess is not None:
-            return self.guess(key)
+            knots = self.guess(key)
+            return replace(knots, x=self.dynamics.valid(jnp.asarray(knots.x)))
         key_x, key_u = jax.random.split(key)
         box, dynamics = self.scatter, self.dynamics
         x = jax.random.uniform(key_x, (self.horizon, dynamics.nx))
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         return Trajectory(
-            box.x_lower + x * (box.x_upper - box.x_lower),
+            dynamics.valid(box.x_lower + x * (box.x_upper - box.x_lower)),
             box.u_lower + u * (box.u_upper - box.u_lower),
         )
 

@@ -12,7 +12,7 @@ lambda <- lambda + mu h. With noise, the noise is white (M = I).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import register_dataclass
 
 from mjx_drax.dynamics import Static
-from mjx_drax.precondition import Bounds, Direction, Identity, Levels, Multipliers
+from mjx_drax.precondition import Bounds, Direction, Identity, Levels, Multipliers, at_rest
 from mjx_drax.problem import Problem, Trajectory
 
 
@@ -31,12 +31,13 @@ class Memory:
     """Pairs s, y (pairs, n), the newest last; 1 / s'y (pairs,), 0 where there is none yet.
 
     `point` and `gradient` (n,) are those of the last step, `count` the steps since lambda changed.
+    n counts tangent numbers; `point` is a trajectory.
     """
 
     s: Array
     y: Array
     curvature: Array
-    point: Array
+    point: Trajectory
     gradient: Array
     count: Array
 
@@ -59,9 +60,9 @@ class LBFGS:
 
     def memory(self, problem: Problem, trajectory: Trajectory) -> Memory:
         """No pairs yet."""
-        n = ravel_pytree(trajectory)[0].shape[0]
-        pairs, zero = jnp.zeros((self.pairs, n)), jnp.zeros(n)
-        return Memory(pairs, pairs, jnp.zeros(self.pairs), zero, zero, jnp.zeros((), jnp.int32))
+        zero = ravel_pytree(at_rest(problem, trajectory))[0]
+        pairs, none = jnp.zeros((self.pairs, zero.shape[0])), jnp.zeros(self.pairs)
+        return Memory(pairs, pairs, none, trajectory, zero, jnp.zeros((), jnp.int32))
 
     def direction(
         self,
@@ -75,19 +76,23 @@ class LBFGS:
     ) -> Direction:
         """The quasi-Newton step; multipliers move in every `inner`-th step only."""
         steepest = Identity().direction(problem, bounds, trajectory, multipliers, levels, key)
-        point, back = ravel_pytree(trajectory)
-        gradient = -ravel_pytree(steepest.drift)[0]
-        memory = self._remember(memory, point, gradient)
+        downhill, back = ravel_pytree(steepest.drift)
+        gradient = -downhill
+        memory = self._remember(problem, memory, trajectory, gradient)
         drift = back(-_inverse_times(memory, gradient))
         update = memory.count == self.inner
         rate = jax.tree.map(lambda r: jnp.where(update, 0.5 * r, 0.0), steepest.multipliers)
         count = jnp.where(update, 0, memory.count)
-        memory = Memory(memory.s, memory.y, memory.curvature, point, gradient, count)
+        memory = Memory(memory.s, memory.y, memory.curvature, trajectory, gradient, count)
         return Direction(drift, steepest.noise, rate, steepest.gains, memory)
 
-    def _remember(self, memory: Memory, point: Array, gradient: Array) -> Memory:
+    def _remember(
+        self, problem: Problem, memory: Memory, trajectory: Trajectory, gradient: Array
+    ) -> Memory:
         """The memory with the last step's pair, if lambda stood still and s'y is positive."""
-        s, y = point - memory.point, gradient - memory.gradient
+        change = jax.tree.map(jnp.subtract, trajectory, memory.point)
+        x = jax.vmap(problem.dynamics.difference)(trajectory.x, memory.point.x)
+        s, y = ravel_pytree(replace(change, x=x))[0], gradient - memory.gradient
         product = jnp.dot(s, y)
         good = (memory.count > 0) & (product > 1e-6 * jnp.dot(s, s))
 

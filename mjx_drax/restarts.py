@@ -358,7 +358,7 @@ def initial_knots(
         if not np.isfinite(array).all():
             raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
         knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
-    return Trajectory(knots[0], knots[1])
+    return Trajectory(problem.dynamics.valid(knots[0]), knots[1])
 
 
 _draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))

@@ -1,0 +1,224 @@
+"""The MJX twin of a MuJoCo model: what is planned with, beside the model that certifies.
+
+MJX computes the same physics from the same `mujoco.MjModel`, with exceptions. Some are mended on a
+copy, where an equal model exists that MJX knows (a solver, a flag, a disabled group). Some MJX
+refuses; the refusal is put in words. Some it computes differently without saying so; `differences`
+names those that a model has. What is left is for the certificate to find.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax._mujoco import mujoco
+from mjx_drax.errors import DraxError
+from mjx_drax.physics import mjx
+
+_DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
+
+
+def twin(
+    model: mujoco.MjModel, contacts: bool = True, bounded: np.ndarray | None = None
+) -> mjx.Model:
+    """The MJX model of a MuJoCo model.
+
+    Args:
+        model: which is not changed.
+        contacts: False leaves contacts out.
+        bounded: joints whose limits the knots keep to, (njnt,). Inside them the limit's force is
+            zero, so its constraint row is left out; the C engine keeps it.
+
+    Raises:
+        DraxError: MJX does not support the model; says what and what to do.
+    """
+    mended = copy.deepcopy(model)
+    if bounded is not None:
+        mended.jnt_limited[bounded] = 0
+    if not contacts:
+        mended.opt.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
+    _mend(mended)
+    try:
+        on_device = mjx.put_model(mended, impl="jax")
+        jax.eval_shape(mjx.make_data, on_device)
+    except (NotImplementedError, ValueError) as error:
+        raise DraxError(_refusal(mended, str(error))) from error
+    # MJX commits its arrays to a device. What is computed from them is then committed as well, and
+    # a loop that is fed its own output would be compiled a second time.
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device)
+
+
+def _mend(model: mujoco.MjModel) -> None:
+    """Change a model into one that MJX knows, with the same motions (or nearly: `differences`)."""
+    opt = model.opt
+    opt.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)  # factorizes M without LAPACK: see `linalg`
+    opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all find the same minimum
+    if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+        opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
+    # With one of the two flags set, MJX leaves out all passive forces
+    springs, dampers = int(_DISABLE.mjDSBL_SPRING), int(_DISABLE.mjDSBL_DAMPER)
+    if not (opt.disableflags & springs and opt.disableflags & dampers):
+        if opt.disableflags & springs:
+            model.jnt_stiffness[:] = 0.0
+            model.tendon_stiffness[:] = 0.0
+        if opt.disableflags & dampers:
+            model.dof_damping[:] = 0.0
+            model.tendon_damping[:] = 0.0
+        opt.disableflags &= ~(springs | dampers)
+    silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
+    model.actuator_gainprm[silent] = 0.0
+    model.actuator_biasprm[silent] = 0.0
+    sensors = {int(s) for s in mjx.SensorType}
+    unknown = np.array([int(s) not in sensors for s in model.sensor_type], bool)
+    model.sensor_type[unknown] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # `differences` names them
+
+
+def _refusal(model: mujoco.MjModel, reason: str) -> str:
+    """What MJX said, with the elements that it means and what to do about them."""
+    if "collisions not implemented" in reason or "margin/gap" in reason:
+        for a, b in contact_pairs(model):
+            kinds = [f"{_GEOM(model.geom_type[g])!s}" for g in (a, b)]
+            if all(kind.split(".")[-1] in reason for kind in kinds):
+                return (
+                    f"MJX cannot collide geoms {geom_name(model, a)!r} and {geom_name(model, b)!r} "
+                    f"({reason}): give them another type, no margin, or contype and conaffinity "
+                    "that keep them apart; or plan with contacts=False."
+                )
+    if "condim" in reason.lower() or "ELLIPTIC" in reason:
+        return f'{reason}: set <option cone="pyramidal"/>, or condim="3" on all geoms.'
+    if "Flex" in reason:
+        return "the model has flexible bodies (flex), which MJX does not simulate: remove them."
+    for names, fix in (
+        (("mjtTrn",), "drive joints, tendons or sites instead"),
+        (("mjtDyn", "mjtGain", "mjtBias"), "use motors, position or velocity servos, or muscles"),
+        (("mjtEq",), "remove these equality constraints"),
+        (("mjtWrap",), "route tendons over spheres and cylinders"),
+        (("mjtEnableBit", "mjENBL"), "clear this flag"),
+    ):
+        if any(name in reason for name in names):
+            return f"MJX does not support {reason}: {fix}."
+    return f"MJX does not support this model: {reason}"
+
+
+def geom_name(model: mujoco.MjModel, g: int) -> str:
+    """A geom's name, or its number and body."""
+    geom = model.geom(g)
+    return str(geom.name or f"geom {g} of body {model.body(int(geom.bodyid[0])).name}")
+
+
+def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
+    """All pairs of geoms between which MuJoCo may make a contact."""
+    if model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+        return
+    yield from zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    type_, affinity, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+    weld = model.body_weldid[body]
+    parent = model.body_weldid[model.body_parentid[weld]]
+    masks = (type_[:, None] & affinity) | (type_ & affinity[:, None])
+    apart = weld[:, None] != weld
+    if not model.opt.disableflags & _DISABLE.mjDSBL_FILTERPARENT:
+        related = (weld[:, None] == parent) | (parent[:, None] == weld)
+        apart &= ~(related & (weld[:, None] != 0) & (weld != 0))
+    excluded = {int(s) for s in model.exclude_signature}
+    for a, b in np.argwhere(np.triu((masks != 0) & apart, 1)).tolist():
+        low, high = sorted((int(body[a]), int(body[b])))
+        if (low << 16) + high not in excluded:
+            yield a, b
+
+
+_ROUGH = {
+    frozenset(kinds)
+    for kinds in (
+        (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID),
+        (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_BOX),
+    )
+}
+"""Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 0.7."""
+
+
+def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
+    """What MJX computes differently from the C engine in this model, a sentence each.
+
+    Found by comparing one step of both over many models: each moved velocities by 2e-5 to 0.7.
+    """
+    opt, found = model.opt, []
+
+    def note(condition: Any, text: str) -> None:
+        if np.any(condition):
+            found.append(text)
+
+    note(
+        opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT,
+        'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
+    )
+    note(
+        opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        'integrator "implicitfast" has other derivatives of velocities in MJX: prefer "Euler"',
+    )
+    note(opt.enableflags & _ENABLE.mjENBL_SLEEP, "bodies do not fall asleep: clear the flag sleep")
+    note(opt.noslip_iterations, "noslip_iterations are not made: set them to 0")
+    note(
+        np.any(model.jnt_stiffnesspoly) or np.any(model.tendon_stiffnesspoly),
+        "polynomial stiffness is left out: use linear springs",
+    )
+    note(
+        np.any(model.dof_dampingpoly) or np.any(model.tendon_dampingpoly),
+        "polynomial damping is left out: use linear dampers",
+    )
+    note(model.actuator_actearly, "early activation (actearly) is left out: set it to false")
+    note(model.actuator_delay, "actuators' delays are left out: remove them")
+    note(model.nplugin, "plugins are left out: remove them")
+    note(
+        np.any(model.actuator_damping) or np.any(model.actuator_armature),
+        "actuators' own damping and armature are left out: give them to the joints",
+    )
+    pair = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
+    note(
+        np.isin(model.eq_type, pair),
+        "connect and weld constraints pull a little differently: prefer joints",
+    )
+    note(model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box")
+    sensors = {int(s) for s in mjx.SensorType}
+    for i, kind in enumerate(model.sensor_type):
+        note(
+            int(kind) not in sensors,
+            f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs",
+        )
+    if contacts:
+        for a, b in contact_pairs(model):
+            kinds = frozenset((_GEOM(model.geom_type[a]), _GEOM(model.geom_type[b])))
+            if kinds in _ROUGH:
+                found.append(
+                    f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
+                    "differ: use spheres, capsules and planes"
+                )
+                break
+    return found
+
+
+def driven(model: mujoco.MjModel) -> np.ndarray:
+    """Joints that an actuator pulls at in the default pose, (njnt,)."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moment = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(
+        moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+    )
+    pulled = np.abs(moment).sum(axis=0) > 0
+    joints = np.zeros(model.njnt, bool)
+    joints[model.dof_jntid[pulled]] = True
+    return joints
+
+
+def has_constraints(model: mjx.Model) -> bool:
+    """Whether a step of the model solves for constraint forces."""
+    return bool(jax.eval_shape(mjx.make_data, model)._impl.efc_J.size)
