@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from mjx_drax.schedules import Geometric as Geometric
     from mjx_drax.solution import Solution as Solution
     from mjx_drax.solution import solve as solve
+    from mjx_drax.terms import Terms as Terms
 
 __version__ = "0.1.0"
 
@@ -64,6 +65,7 @@ _HOME = {
     "Geometric": "schedules",
     "Solution": "solution",
     "solve": "solution",
+    "Terms": "terms",
 }
 
 __all__ = sorted(_HOME)
