@@ -23,10 +23,11 @@ from jax.tree_util import register_dataclass
 from numpy.typing import ArrayLike
 
 from mjx_drax._mujoco import mujoco
-from mjx_drax.distances import DISTANCES, SPHERE, Shape, norm
+from mjx_drax.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.dynamics import Static, as_partial
 from mjx_drax.errors import DraxError
 from mjx_drax.mjcf import index, load
+from mjx_drax.rotations import product, rotation_vector
 
 Names = str | Iterable[str]
 
@@ -54,11 +55,11 @@ class Term:
 
     def __add__(self, other: Callable[..., Array] | int) -> Term:
         """Both residuals in one vector, this one's first; `sum` of terms works as well."""
-        return self if other == 0 else _sum(self, other)
+        return self if isinstance(other, int) and other == 0 else _sum(self, other)
 
     def __radd__(self, other: Callable[..., Array] | int) -> Term:
         """The same, the other one's first."""
-        return self if other == 0 else _sum(other, self)
+        return self if isinstance(other, int) and other == 0 else _sum(other, self)
 
 
 def _sum(*parts: Any) -> Term:
@@ -177,11 +178,7 @@ class Terms:
                 is the rotation vector from it, in its axes, which jumps at half a turn.
             weight: one number, or (3,) or (6,).
         """
-        site = index(self.model, "site", name)
-        body, turned = int(self.model.site_bodyid[site]), self.model.site_quat[site]
-        return _pose(
-            f"site {name!r}", "site_xpos", site, body, turned, position, orientation, weight
-        )
+        return self._pose("site", name, position, orientation, weight)
 
     def body(
         self,
@@ -192,8 +189,7 @@ class Terms:
         weight: ArrayLike = 1.0,
     ) -> Term:
         """The same for the frame of a body."""
-        body, turned = index(self.model, "body", name), np.array([1.0, 0, 0, 0])
-        return _pose(f"body {name!r}", "xpos", body, body, turned, position, orientation, weight)
+        return self._pose("body", name, position, orientation, weight)
 
     def upright(
         self,
@@ -249,6 +245,32 @@ class Terms:
         used = tuple(sizes[np.array(group)[:, :2]] for group in groups.values())
         return _term(_clearance, (where, order), (wanted, *used), "clearance", len(pairs), 1.0)
 
+    def _pose(
+        self,
+        kind: str,
+        name: str,
+        position: ArrayLike | None,
+        orientation: ArrayLike | None,
+        weight: ArrayLike,
+    ) -> Term:
+        model, label, at = self.model, f"{kind} {name!r}", index(self.model, kind, name)
+        size = 3 * ((position is not None) + (orientation is not None))
+        if not size:
+            raise DraxError(f"{label} has no target: give a position, an orientation or both.")
+        weights, parts = _weights(label, size, weight), []
+        if position is not None:
+            wanted = _numbers(f"position of {label}", position, 3)
+            where = ("site_xpos" if kind == "site" else "xpos", at)
+            parts.append(_term(_read, where, (wanted,), label, 3, weights[:3]))
+        if orientation is not None:
+            # A site is turned by a fixed quaternion within its body, whose own is in mjx.Data.
+            body, turned = at, np.array([1.0, 0.0, 0.0, 0.0])
+            if kind == "site":
+                body, turned = int(model.site_bodyid[at]), model.site_quat[at]
+            wanted = _quaternion(f"orientation of {label}", orientation)
+            parts.append(_term(_orientation, (body,), (wanted, turned), label, 3, weights[-3:]))
+        return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+
     def _indices(self, kind: str, names: Names) -> list[int]:
         found = [index(self.model, kind, n) for n in ([names] if isinstance(names, str) else names)]
         if not found:
@@ -281,20 +303,14 @@ def _posture(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) 
     parts = [data.qpos[differences] - target[differences]]
     if len(quaternions):
         at = quaternions[:, None] + np.arange(4)
-        parts.append(jax.vmap(_turn)(target[at], data.qpos[at]).ravel())
+        parts.append(jax.vmap(rotation_vector)(data.qpos[at], target[at]).ravel())
     return jnp.concatenate(parts)[places]
-
-
-def _position(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
-    name, at, _ = where
-    return getattr(data, name)[at] - target
 
 
 def _orientation(
     data: Any, u: Array | None, where: tuple[Any, ...], target: Array, turned: Array
 ) -> Array:
-    *_, body = where
-    return _turn(target, _product(data.xquat[body], turned))
+    return rotation_vector(product(data.xquat[where[0]], turned), target)
 
 
 def _upright(data: Any, u: Array | None, where: tuple[Any, ...], axis: Array, up: Array) -> Array:
@@ -313,28 +329,6 @@ def _clearance(
         ]
         distances.append(jax.vmap(DISTANCES[kinds])(*shapes))
     return margin - jnp.concatenate(distances)[np.array(order)]
-
-
-# Rotations
-
-
-def _product(p: Array, q: Array) -> Array:
-    """The quaternion of the rotation q, then p; (4,) each, scalar first."""
-    vector = p[0] * q[1:] + q[0] * p[1:] + jnp.cross(p[1:], q[1:])
-    return jnp.concatenate([(p[0] * q[0] - p[1:] @ q[1:])[None], vector])
-
-
-def _turn(target: Array, q: Array) -> Array:
-    """Rotation vector (3,) [rad] of target^-1 q, of length pi at most; smooth at zero."""
-    difference = _product(target * np.array([1.0, -1.0, -1.0, -1.0]), q)
-    w, v = difference[0], difference[1:]
-    w, v = jnp.abs(w), jnp.where(w < 0, -v, v)
-    square = v @ v
-    small = square < 1e-4 * w**2
-    length, above = norm(v), jnp.where(small, w, 1.0)
-    near = (2 - 2 / 3 * square / above**2) / above  # 2 arctan(|v| / w) / |v|, to fourth order
-    far = 2 * jnp.arctan2(length, w) / jnp.where(small, 1.0, length)
-    return jnp.where(small, near, far) * v
 
 
 # What a user gives
@@ -372,31 +366,6 @@ def _quaternion(label: str, value: Any) -> np.ndarray:
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, matrix.ravel())
     return quaternion
-
-
-def _pose(
-    label: str,
-    attribute: str,
-    at: int,
-    body: int,
-    turned: np.ndarray,
-    position: ArrayLike | None,
-    orientation: ArrayLike | None,
-    weight: ArrayLike,
-) -> Term:
-    """Position and orientation of a frame that is turned by a quaternion within its body."""
-    size = 3 * ((position is not None) + (orientation is not None))
-    if not size:
-        raise DraxError(f"{label} has no target: give a position, an orientation or both.")
-    weights = _weights(label, size, weight)
-    where, parts = (attribute, at, body), []
-    if position is not None:
-        target = _numbers(f"position of {label}", position, 3)
-        parts.append(_term(_position, where, (target,), label, 3, weights[:3]))
-    if orientation is not None:
-        target = _quaternion(f"orientation of {label}", orientation)
-        parts.append(_term(_orientation, where, (target, turned), label, 3, weights[-3:]))
-    return sum(parts, start=0)  # type: ignore[return-value]
 
 
 def _weights(label: str, size: int, weight: ArrayLike) -> np.ndarray:

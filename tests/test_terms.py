@@ -1,6 +1,7 @@
 """Terms and distances against MuJoCo's C engine; derivatives, errors, and what recompiles."""
 
 import itertools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from mujoco import mjx
 from mjx_drax import DraxError, Terms, from_mjcf
 from mjx_drax.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.dynamics import as_partial
+from mjx_drax.models import path
 
 ROBOT = """
 <mujoco model="robot">
@@ -355,3 +357,16 @@ def test_terms_go_where_functions_go():
     assert values._cache_size() == 1
     with pytest.raises(DraxError, match="called without u"):
         from_mjcf(ARM, horizon=0.04, terminal_residual=on.control())
+
+
+def test_the_example_of_the_readme():
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    code = next(c for c in readme.split("```")[1::2] if "Terms(" in c)
+    code = code.removeprefix("python").replace('"robot.xml"', repr(str(path("cartpole"))))
+    code, call = code.split("solution = mjx_drax.solve(problem, chains=64, guess=")
+    names = {}
+    exec(code, names)
+    problem, guess = names["problem"], eval(call.strip()[:-1], names)
+    assert guess.x.shape == (64, problem.horizon, 4)
+    close(guess.x[0, 49, :2], [0.5, 1.5])
+    assert (problem.constraint.inequalities, problem.horizon) == (2, 100)
