@@ -3,13 +3,15 @@
 A path of positions q(t) becomes a trajectory: q_k = q(k dt), velocities by backward differences in
 tangent space, v_k = (q_k - q_{k-1}) / dt, and controls by the C engine's inverse dynamics,
 
-    min |A u - b|   with   A = d tau / d u,   b = tau(q_k, v_k, (v_{k+1} - v_k) / dt) - tau(u = 0),
+    min |A (u - rest) - b|,        A = d tau / d u,
+                                   b = tau(q_k, v_k, (v_{k+1} - v_k) / dt) - tau(rest),
 
-the smallest change from the middle of the control bounds (0 where they are infinite), clipped to
-them. An actuator with a state (its force does not depend on u at once) stays there, and so does
-every actuator at a knot where the engine finds no finite answer: a guess never fails for its
-controls. States are clipped to their bounds; activations stay as they are in x_init. Positions are
-moved by MuJoCo's own functions, so quaternions are turned about one axis and stay unit.
+with the least change from rest, the middle of the control bounds (0 where they are infinite), and
+clipped to the bounds; limits of the actuators' forces are not heeded. An actuator with a state (its
+force does not depend on u at once) stays at rest, and so does every actuator at a knot where the
+engine finds no finite answer: a guess never fails for its controls. States are clipped to their
+bounds; activations stay as they are in x_init. Positions are moved by MuJoCo's own functions, so
+quaternions are turned about one axis and stay unit.
 """
 
 from __future__ import annotations
@@ -33,12 +35,11 @@ Pose = str | ArrayLike
 
 
 def still(problem: Problem) -> Trajectory:
-    """The pose of x_init, held at rest; for problems without a model x_init and u = 0, clipped."""
+    """The pose of x_init, held at rest; without a model, x_init and the middle of the controls."""
     if not hasattr(problem.dynamics, "mj_model"):
-        x = np.broadcast_to(problem.x_init, (problem.horizon, problem.dynamics.nx))
-        return _bounded(
-            problem, x, np.broadcast_to(_rest(problem), (problem.horizon, _nu(problem)))
-        )
+        K, dynamics = problem.horizon, problem.dynamics
+        x = np.broadcast_to(problem.x_init, (K, dynamics.nx))
+        return _bounded(problem, x, np.broadcast_to(_rest(problem), (K, dynamics.nu)))
     return waypoints(problem, [])
 
 
@@ -71,7 +72,7 @@ def keyframes(
     """Through keyframes of the model: evenly spread in order, or at the times of {time [s]: name}.
 
     The first is at time 0 and the last at the horizon; a single one is at the horizon. By default
-    all of them, in the order of the model.
+    all of them, in the order of the model. Only their qpos is used.
 
     Raises:
         DraxError: there are none, or none of that name; the problem has no model.
@@ -94,7 +95,7 @@ def path(problem: Problem, qpos: ArrayLike, dt: float | None = None) -> Trajecto
         problem: from a model.
         qpos: the positions, the first at time 0.
         dt: time between them [s]; by default they are stretched over the horizon. A path that ends
-            earlier is held there.
+            earlier is held there, a longer one is cut.
 
     Raises:
         DraxError: the path does not fit the model, or dt is not a positive number; the problem has
@@ -134,12 +135,12 @@ def spread(
     Raises:
         DraxError: the trajectory has another shape; chains or scale are not positive.
     """
-    K, nx = problem.horizon, problem.dynamics.nx
+    K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
     x, u = np.asarray(trajectory.x, float), np.asarray(trajectory.u, float)
-    if x.shape != (K, nx) or u.shape != (K, _nu(problem)):
+    if x.shape != (K, nx) or u.shape != (K, nu):
         raise DraxError(
             f"the trajectory has shapes {x.shape} and {u.shape}: give x ({K}, {nx}) and "
-            f"u ({K}, {_nu(problem)})."
+            f"u ({K}, {nu})."
         )
     if chains < 1 or not 0 < scale < np.inf:
         raise DraxError(f"chains is {chains}, scale is {scale}: give positive numbers.")
@@ -149,7 +150,7 @@ def spread(
         for low, high in ((box.x_lower, box.x_upper), (box.u_lower, box.u_upper))
     )
     model = getattr(problem.dynamics, "mj_model", None)
-    du = half_u * _waves(rng, chains, K, _nu(problem))[:, :-1]
+    du = half_u * _waves(rng, chains, K, nu)[:, :-1]
     if model is None:
         return _bounded(problem, x + half_x * _waves(rng, chains, K, nx)[:, 1:], u + du)
     turn = _per_dof(model, half_x, scale * np.pi) * _waves(rng, chains, K, model.nv)[:, 1:]
@@ -186,10 +187,6 @@ def _per_dof(model: mujoco.MjModel, widths: np.ndarray, turn: float) -> np.ndarr
     free, ball = (kind == k for k in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
     turns = ball | (free & (place >= 3))
     return np.where(turns, turn, widths[..., model.jnt_qposadr[joint] + place])
-
-
-def _nu(problem: Problem) -> int:
-    return problem.dynamics.nu
 
 
 def _model(problem: Problem) -> mujoco.MjModel:

@@ -108,7 +108,7 @@ class Terms:
         if isinstance(target, str):
             qpos = np.array(model.key_qpos[index(model, "keyframe", target)])
         elif isinstance(target, Mapping):
-            joints = [index(model, "joint", name) for name in target]
+            joints = self._indices("joint", target)
             for joint, (name, value) in zip(joints, target.items(), strict=True):
                 at, size = model.jnt_qposadr[joint], _QPOS[model.jnt_type[joint]]
                 qpos[at : at + size] = _numbers(f"posture of {name!r}", value, size)

@@ -296,6 +296,7 @@ def test_numbers_do_not_recompile():
         (lambda: ON.velocity(weight=np.nan), "weight of velocity is nan"),
         (lambda: ON.velocity("rail", weight=[1, 2]), "weight of velocity is .1, 2.: give 1"),
         (lambda: ON.velocity([]), "no joint is named"),
+        (lambda: ON.posture({}), "no joint is named"),
         (lambda: ON.site("tip"), "site 'tip' has no target"),
         (lambda: ON.site("tip", [0, 0, np.inf]), "position of site 'tip'"),
         (lambda: ON.site("tip", orientation=np.ones((3, 3))), "give a rotation matrix"),
