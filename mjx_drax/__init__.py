@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mjx_drax import guesses as guesses
     from mjx_drax.bounds import LogBarrier as LogBarrier
     from mjx_drax.bounds import Projection as Projection
     from mjx_drax.bounds import Reflection as Reflection
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from mjx_drax.schedules import Geometric as Geometric
     from mjx_drax.solution import Solution as Solution
     from mjx_drax.solution import solve as solve
+    from mjx_drax.terms import Terms as Terms
 
 __version__ = "0.1.0"
 
@@ -64,15 +66,18 @@ _HOME = {
     "Geometric": "schedules",
     "Solution": "solution",
     "solve": "solution",
+    "Terms": "terms",
 }
 
-__all__ = sorted(_HOME)
+__all__ = sorted([*_HOME, "guesses"])
 
 if not (Path(__file__).parent / "tasks").is_dir():  # a checkout: tasks and models lie beside us
     __path__.append(str(Path(__file__).parents[1]))
 
 
 def __getattr__(name: str) -> Any:
+    if name == "guesses":
+        return import_module("mjx_drax.guesses")
     if name not in _HOME:
         raise AttributeError(f"module 'mjx_drax' has no attribute {name!r}")
     value = getattr(import_module(f"mjx_drax.{_HOME[name]}"), name)

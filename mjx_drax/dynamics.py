@@ -105,9 +105,18 @@ def as_partial(function: Callable[..., Any]) -> Partial:
     """The function as a pytree: static code, traced arguments.
 
     A `jax.tree_util.Partial` given by the user keeps its bound arguments as traced leaves, which
-    is how a cost or a model takes parameters that may change without recompiling.
+    is how a cost or a model takes parameters that may change without recompiling. So does any other
+    callable that is registered as a pytree, like the terms of `mjx_drax.Terms`.
     """
-    return function if isinstance(function, Partial) else Partial(function)
+    if isinstance(function, Partial):
+        return function
+    if not jax.tree_util.all_leaves([function]):
+        return Partial(_call, function)
+    return Partial(function)
+
+
+def _call(function: Callable[..., Any], *arguments: Any) -> Any:
+    return function(*arguments)
 
 
 @register_dataclass

@@ -336,6 +336,31 @@ def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
         raise DraxError(f"MuJoCo cannot compile {str(source)[:80]!r}: {error}") from error
 
 
+_COUNTS = {
+    "joint": "njnt",
+    "site": "nsite",
+    "body": "nbody",
+    "geom": "ngeom",
+    "actuator": "nu",
+    "sensor": "nsensor",
+    "keyframe": "nkey",
+}
+
+
+def index(model: mujoco.MjModel, kind: str, name: str) -> int:
+    """Number of an element of a model: a joint, site, body, geom, actuator, sensor or keyframe.
+
+    Raises:
+        DraxError: there is none of that name; lists those that there are.
+    """
+    element = getattr(model, "key" if kind == "keyframe" else kind)
+    names = [element(i).name for i in range(getattr(model, _COUNTS[kind]))]
+    if not isinstance(name, str) or not name or name not in names:
+        known = ", ".join(repr(n) for n in names if n) or "no named one"
+        raise DraxError(f"{_model_name(model)} has no {kind} {name!r}: there is {known}.")
+    return names.index(name)
+
+
 def from_mjcf(
     model: str | Path | mujoco.MjModel,
     *,
