@@ -72,7 +72,7 @@ class Joints:
         if not self.quaternions:
             return x - y
         parts = [
-            quaternion.log(quaternion.multiply(quaternion.inverse(y[q]), x[q]))
+            quaternion.between(y[q], x[q])
             if turning
             else x[q] - y[q]
             for q, _, turning in self._parts()

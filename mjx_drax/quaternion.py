@@ -59,6 +59,11 @@ def log(q: Array) -> Array:
     return 2.0 * ratio * v
 
 
+def between(p: Array, q: Array) -> Array:
+    """Rotation vectors (..., 3) [rad] from p to q in p's own frame, for unit quaternions (..., 4)."""
+    return log(multiply(inverse(p), q))
+
+
 def normalized(q: Array) -> Array:
     """Quaternions (..., 4) scaled to unit length; one of length 0 becomes the identity."""
     square = jnp.sum(jnp.square(q), axis=-1, keepdims=True)

@@ -22,12 +22,12 @@ from jax import Array
 from jax.tree_util import register_dataclass
 from numpy.typing import ArrayLike
 
+from mjx_drax import quaternion
 from mjx_drax._mujoco import mujoco
 from mjx_drax.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.dynamics import Static, as_partial
 from mjx_drax.errors import DraxError
 from mjx_drax.mjcf import index, load
-from mjx_drax.rotations import product, rotation_vector
 
 Names = str | Iterable[str]
 
@@ -303,14 +303,14 @@ def _posture(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) 
     parts = [data.qpos[differences] - target[differences]]
     if len(quaternions):
         at = quaternions[:, None] + np.arange(4)
-        parts.append(jax.vmap(rotation_vector)(data.qpos[at], target[at]).ravel())
+        parts.append(quaternion.between(target[at], data.qpos[at]).ravel())
     return jnp.concatenate(parts)[places]
 
 
 def _orientation(
     data: Any, u: Array | None, where: tuple[Any, ...], target: Array, turned: Array
 ) -> Array:
-    return rotation_vector(product(data.xquat[where[0]], turned), target)
+    return quaternion.between(target, quaternion.multiply(data.xquat[where[0]], turned))
 
 
 def _upright(data: Any, u: Array | None, where: tuple[Any, ...], axis: Array, up: Array) -> Array:
