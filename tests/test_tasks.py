@@ -1,0 +1,138 @@
+"""Tasks and models: they load and are built, stand or hover, and obstacles are real in MuJoCo."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError, tasks
+from mjx_drax.models import path
+from mjx_drax.tasks._distance import boxes, capsules
+
+SIZES = {  # nq, nv, nu and K
+    "double_pendulum_swingup": (3, 3, 1, 150),
+    "quadrotor_planar": (3, 3, 2, 100),
+    "car_bug_trap": (3, 3, 2, 119),
+    "car_deep_trap": (3, 3, 2, 119),
+    "arm_reach": (7, 7, 7, 50),
+}
+MODELS = {  # nq, nv and nu, of what needs free joints or contacts as well
+    "quadrotor": (7, 6, 4),
+    "hopper": (6, 6, 3),
+    "box_push": (5, 5, 2),
+    "quadruped": (19, 18, 12),
+    "humanoid": (28, 27, 21),
+}
+WAITING = ("quadrotor", "hopper_jump", "box_push", "quadruped_step", "humanoid_stand")
+AGAINST = {  # the controls drive straight into an obstacle, after so many steps
+    "quadrotor_planar": ({"qpos": [-2.0, 1.0, -0.3]}, [2.6, 2.6], 100),
+    "car_bug_trap": ({}, [1.0, 1.0], 100),
+    "car_deep_trap": ({}, [1.0, 1.0], 100),
+    "arm_reach": ({}, [0.2, -0.25, 0.0, -0.13, 0.0, 0.0, 0.0], 200),
+}
+
+
+def model(name):
+    return mujoco.MjModel.from_xml_path(str(path(name)))
+
+
+def started(model):
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    return data
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_is_built_with_its_sizes_and_starts_short_of_its_goal(name):
+    problem = tasks.load(name).make()
+    host = problem.dynamics.mj_model
+    assert (host.nq, host.nv, host.nu, problem.horizon) == SIZES[name]
+    assert problem.reached(np.asarray(problem.x_init, float)) is False
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_start_is_clear(name):
+    problem = tasks.load(name).make()
+    seen = problem.dynamics.observe(problem.x_init, np.zeros(problem.dynamics.nu))
+    values = problem.constraint(seen, np.zeros(problem.dynamics.nu))
+    assert np.all(np.asarray(values) <= 0)
+
+
+@pytest.mark.parametrize("name", AGAINST)
+def test_obstacles_stop_in_the_c_engine_what_runs_into_them(name):
+    problem = tasks.load(name).make()
+    host = problem.dynamics.mj_model
+    start, control, steps = AGAINST[name]
+    data = started(host)
+    for key, value in start.items():
+        getattr(data, key)[:] = value
+    data.ctrl[:] = control
+    mujoco.mj_forward(host, data)
+    assert data.ncon == 0
+    touched = False
+    for _ in range(steps):
+        mujoco.mj_step(host, data)
+        touched |= data.ncon > 0
+    assert touched
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_models_of_tasks_to_come_have_their_sizes(name):
+    host = model(name)
+    assert (host.nq, host.nv, host.nu) == MODELS[name]
+    assert host.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert host.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+
+
+@pytest.mark.parametrize("name", ["quadrotor", "quadruped", "humanoid"])
+def test_stands_or_hovers_under_a_constant_control(name):
+    host = model(name)
+    data = started(host)
+    data.ctrl[:] = host.key_ctrl[0] if host.nkey else 9.81 / 4
+    height = data.qpos[2]
+    mujoco.mj_step(host, data, 200)
+    assert abs(data.qpos[2] - height) < 0.03
+    assert data.xmat[1, 8] > 0.99
+    assert np.abs(data.qvel).max() < 0.2
+
+
+@pytest.mark.parametrize("name", ["hopper", "box_push", "quadruped", "humanoid"])
+def test_only_the_pairs_that_matter_can_touch(name):
+    host = model(name)
+    touching = {g for g in range(host.ngeom) if host.geom_contype[g] or host.geom_conaffinity[g]}
+    kinds = {mujoco.mjtGeom(host.geom_type[g]) for g in touching}
+    plane, sphere = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE
+    assert kinds == {sphere, mujoco.mjtGeom.mjGEOM_BOX if name == "box_push" else plane}
+    assert not any(host.geom_contype[g] and host.geom_conaffinity[g] for g in touching)
+
+
+@pytest.mark.parametrize("name", WAITING)
+def test_waits_for_what_is_not_supported_yet(name):
+    with pytest.raises(DraxError, match="not supported yet"):
+        tasks.load(name).make()
+
+
+@pytest.mark.parametrize(("name", "axes"), [("quadrotor_planar", "xz"), ("quadrotor", "xyz")])
+def test_distances_are_those_of_mujoco(name, axes):
+    """Against mj_geomDistance, from a small sphere that is moved about."""
+    host = model(name)
+    which = ["xyz".index(axis) for axis in axes]
+    distance = (boxes if name == "quadrotor_planar" else capsules)(
+        host, *([axes] if axes != "xyz" else [])
+    )
+    data = started(host)
+    hull = host.geom("hull").id
+    solid = (host.geom_bodyid == 0) & (host.geom_contype != 0)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        data.qpos[:3] = rng.uniform([-3, -1.5 if axes == "xyz" else 0.3, 0.3], [3, 1.5, 2.5])
+        if axes == "xz":
+            data.qpos[2] = 0.0
+        mujoco.mj_forward(host, data)
+        ours = np.asarray(distance(data.geom_xpos[hull][which]))
+        theirs = [
+            mujoco.mj_geomDistance(host, data, hull, g, 10.0, None) for g in np.flatnonzero(solid)
+        ]
+        apart = np.array(theirs) > 0  # inside, MuJoCo's is another measure
+        off = ours - host.geom_size[hull, 0] - np.array(theirs)
+        assert np.abs(off[apart]).max(initial=0) < 1e-4
