@@ -60,7 +60,7 @@ def log(q: Array) -> Array:
 
 
 def between(p: Array, q: Array) -> Array:
-    """Rotation vectors (..., 3) [rad] from p to q in p's own frame, for unit quaternions (..., 4)."""
+    """Rotation vectors (..., 3) [rad] from p to q, in p's frame, of unit quaternions (..., 4)."""
     return log(multiply(inverse(p), q))
 
 
