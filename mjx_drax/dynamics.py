@@ -63,6 +63,11 @@ class Dynamics:
         """What cost functions receive for the knot (x, u): here the state itself."""
         return x
 
+    @property
+    def kinked(self) -> bool:
+        """Whether f has kinks, as contacts make them: an answer may need `restarts`' mending."""
+        return False
+
     def differentiator(self, by: Any) -> Any:
         """How functions of one knot of this system are best differentiated, if asked to by `by`."""
         return by

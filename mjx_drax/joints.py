@@ -72,9 +72,7 @@ class Joints:
         if not self.quaternions:
             return x - y
         parts = [
-            quaternion.between(y[q], x[q])
-            if turning
-            else x[q] - y[q]
+            quaternion.between(y[q], x[q]) if turning else x[q] - y[q]
             for q, _, turning in self._parts()
         ]
         return jnp.concatenate([*parts, x[self.nq :] - y[self.nq :]])

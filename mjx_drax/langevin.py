@@ -234,6 +234,16 @@ class Langevin:
             died_at=jnp.full(chains, -1),
         )
 
+    def moved_to(self, problem: Problem, state: State, trajectory: Trajectory) -> State:
+        """The chains with other knots (chains, K, ...), and damped as at first."""
+
+        def inside(knots: Trajectory) -> Trajectory:
+            return self.bounds.interior(problem.bounds, _with_slack(problem, knots))
+
+        return replace(
+            state, trajectory=jax.vmap(inside)(trajectory), damping=jnp.ones_like(state.damping)
+        )
+
     def step(
         self, problem: Problem, state: State, iteration: ArrayLike, tail: bool = True
     ) -> State:

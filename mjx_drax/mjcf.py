@@ -39,7 +39,7 @@ from mjx_drax.problem import (
     vector,
 )
 from mjx_drax.scalar import scalarized
-from mjx_drax.twin import driven, twin
+from mjx_drax.twin import driven, has_constraints, twin
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
@@ -188,6 +188,11 @@ class MjxDynamics(Dynamics):
     def observe(self, x: Array, u: Array) -> mjx.Data:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
         return _observe(self.model, self.structure, x, u)
+
+    @property
+    def kinked(self) -> bool:
+        """Whether contacts, limits or dry friction act in f."""
+        return has_constraints(self.model)
 
     def differentiator(self, by: Any) -> Any:
         """Exact derivatives in scalar arithmetic; others as they are."""

@@ -29,7 +29,19 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, State, advance, evaluate
+from mjx_drax.langevin import (
+    DAMPING,
+    EASE,
+    FEASIBLE,
+    TIGHTEN,
+    Info,
+    Langevin,
+    Scale,
+    State,
+    advance,
+    evaluate,
+)
+from mjx_drax.linalg import exact
 from mjx_drax.problem import Problem, Trajectory
 from mjx_drax.schedules import Geometric
 
@@ -42,6 +54,9 @@ UNIT = 1 / 300
 
 MORE = 10.0
 """Factor on the unit of cost after an attempt in which not one chain became feasible."""
+
+MENDINGS, STEPS = 30, 2
+"""Rounds of replays after an attempt, and iterations of the tail in each, where f has kinks."""
 
 NEGLIGIBLE = 0.03
 """Differences of cost below so many units do not count."""
@@ -152,6 +167,7 @@ class Run(Attempt):
     solve_time: float
 
 
+@exact
 def run(
     problem: Problem,
     chains: int,
@@ -209,6 +225,7 @@ class _Search:
         clock = time.perf_counter()
         self.records.append((0, info))
         kept, complete = self._attempt(first, state, info, total)
+        kept = self._mended(first, kept, total)
         for attempt in range(1, solver.attempts):
             left = np.flatnonzero(~_finished(kept, solver.within, unit))
             if not complete or len(left) <= (1.0 - solver.enough) * self.chains:
@@ -220,6 +237,7 @@ class _Search:
                 flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
             try:
                 found, complete = self._attempt(flow, *self._start(flow, attempt), total)
+                found = self._mended(flow, found, total)
                 kept = _best(kept, found, owners)
             except KeyboardInterrupt:  # between two attempts
                 break
@@ -232,6 +250,58 @@ class _Search:
         key_knots, key_noise = jax.random.split(jax.random.fold_in(key, attempt))
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
         return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
+
+    def _mended(self, flow: Langevin, kept: Attempt, expected: int) -> Attempt:
+        """The attempt, its chains led on along replays where f has kinks.
+
+        Where contacts switch, linear models of f are wrong, and steps that trust them leave
+        defects. A replay has none. So each chain takes its replay, and then every two steps of the
+        tail are replayed with their feedback: what is feasible and cheaper is kept, and chains for
+        which it is not are damped more.
+        """
+        if not self.problem.dynamics.kinked or kept.feasible.all() or flow.tail < STEPS:
+            return kept
+        everyone, total = np.arange(self.chains), flow.iterations + flow.tail
+        for with_feedback in (0.0, 1.0):
+            kept = _best(kept, self._replayed(flow, kept, with_feedback), everyone)
+        damping = np.ones(self.chains)
+        for _ in range(MENDINGS):
+            state = replace(kept.state, damping=jnp.asarray(damping, kept.state.damping.dtype))
+            state, info = _advance(flow, self.problem, state, total - STEPS, total, True)
+            self.done += STEPS
+            tried = Attempt(state, info, np.full(self.chains, self.done))
+            replayed = self._replayed(flow, tried, 1.0)
+            before = np.asarray(kept.info.cost), kept.feasible
+            kept = _best(_best(kept, tried, everyone), replayed, everyone)
+            cheaper = np.asarray(kept.info.cost) < before[0] * (1 - 1e-3)
+            improved = cheaper | (kept.feasible & ~before[1])
+            damping = np.clip(damping * np.where(improved, EASE, TIGHTEN), *DAMPING)
+            self.records.append((self.done, kept.info))
+            if self.progress is not None:
+                self.progress(self.done, max(self.done, expected), kept.info)
+            print(
+                "mend",
+                kept.feasible.mean(),
+                improved.mean(),
+                np.sort(np.asarray(kept.info.cost)[kept.feasible])[:4],
+            )
+            if not improved.any() and (damping >= DAMPING[1]).all():
+                break
+        return kept
+
+    def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float) -> Attempt:
+        """Every chain's knots replaced by a replay of its controls."""
+        problem, knots = self.problem, kept.state.trajectory
+        bounds, dtype = problem.bounds, knots.x.dtype
+        states, controls = problem.dynamics.replay(
+            np.asarray(problem.with_start(knots), float),
+            np.asarray(knots.u, float),
+            with_feedback * np.asarray(kept.state.gains, float),
+            (np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)),
+        )
+        replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
+        state, info = _moved_to(flow, problem, kept.state, replayed)
+        return Attempt(state, info, np.full(self.chains, self.done))
 
     def _attempt(
         self, flow: Langevin, state: State, info: Info, expected: int
@@ -262,6 +332,15 @@ def _advance(
 ) -> tuple[State, Info]:
     """`advance` and `evaluate` in one launch."""
     state = advance(flow, problem, state, start, stop, tail)
+    return state, evaluate(problem, state.trajectory)
+
+
+@jax.jit
+def _moved_to(
+    flow: Langevin, problem: Problem, state: State, knots: Trajectory
+) -> tuple[State, Info]:
+    """`Langevin.moved_to` and `evaluate` in one launch."""
+    state = flow.moved_to(problem, state, knots)
     return state, evaluate(problem, state.trajectory)
 
 

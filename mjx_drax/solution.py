@@ -23,6 +23,7 @@ import numpy as np
 
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Langevin, evaluate, feedback_gains
+from mjx_drax.linalg import exact
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
 from mjx_drax.restarts import Progress, Restarts, Run, run
@@ -239,6 +240,7 @@ def solve(
     return _certified(problem, solver, seed, run(problem, chains, seed, solver, guess, progress))
 
 
+@exact
 def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Run) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
     state, records = run.state, run.records
