@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError
 from mjx_drax.mjcf import index
-from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.problem import Box, Problem, Trajectory
 
 Pose = str | ArrayLike
 """Name of a keyframe, or qpos (nq,)."""
@@ -39,7 +39,7 @@ def still(problem: Problem) -> Trajectory:
     if not hasattr(problem.dynamics, "mj_model"):
         K, dynamics = problem.horizon, problem.dynamics
         x = np.broadcast_to(problem.x_init, (K, dynamics.nx))
-        return _bounded(problem, x, np.broadcast_to(_rest(problem), (K, dynamics.nu)))
+        return _bounded(problem, x, np.broadcast_to(middle(problem.bounds), (K, dynamics.nu)))
     return waypoints(problem, [])
 
 
@@ -249,7 +249,7 @@ def _through(problem: Problem, times: np.ndarray, qpos: np.ndarray) -> Trajector
     start = np.asarray(problem.x_init, float)
     act = np.broadcast_to(start[model.nq + model.nv :], (problem.horizon, model.na))
     states = np.concatenate([start[None], np.concatenate([q[1:], v, act], axis=1)])
-    return _bounded(problem, states[1:], controls(model, states, dt, _rest(problem)))
+    return _bounded(problem, states[1:], controls(model, states, dt, middle(problem.bounds)))
 
 
 def controls(model: mujoco.MjModel, x: np.ndarray, dt: float, rest: np.ndarray) -> np.ndarray:
@@ -291,12 +291,12 @@ def _moment(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     return moment
 
 
-def _rest(problem: Problem) -> np.ndarray:
+def middle(bounds: Box) -> np.ndarray:
     """Middle of the control bounds, or 0 clipped to them where an end is infinite."""
-    low, high = (np.asarray(e, float) for e in (problem.bounds.u_lower, problem.bounds.u_upper))
+    low, high = (np.asarray(end, float) for end in (bounds.u_lower, bounds.u_upper))
     with np.errstate(invalid="ignore"):
-        middle = (low + high) / 2
-    return np.where(np.isfinite(middle), middle, np.clip(0.0, low, high))
+        half = (low + high) / 2
+    return np.where(np.isfinite(half), half, np.clip(0.0, low, high))
 
 
 def _bounded(problem: Problem, x: np.ndarray, u: np.ndarray) -> Trajectory:

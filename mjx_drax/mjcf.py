@@ -28,6 +28,7 @@ from mjx_drax.joints import Joints
 from mjx_drax.physics import mjx
 from mjx_drax.problem import (
     Aside,
+    Box,
     Problem,
     Trajectory,
     box,
@@ -40,6 +41,9 @@ from mjx_drax.problem import (
 )
 from mjx_drax.scalar import scalarized
 from mjx_drax.twin import driven, has_constraints, twin
+
+CLOSE = 0.03
+"""Share of the usual scatter of initial knots that is left where f has kinks."""
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
@@ -412,8 +416,11 @@ def from_mjcf(
         x_bounds: (lower, upper) on states, each broadcastable to (nx,).
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
-            rad for hinges, +-1 m for slides and +-5 (rad/s or m/s) for velocities about x_init.
+            rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
+            +-5 (rad/s or m/s) for velocities about x_init. Where contacts, limits or dry friction
+            act, the default is x_init +- `CLOSE` of this.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
+            Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: False plans as if nothing could touch, which is right where constraints keep
             things apart. The C engine that certifies keeps its contacts.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
@@ -432,7 +439,6 @@ def from_mjcf(
     dynamics = MjxDynamics(
         twin(host, contacts, bounded), substeps * host.opt.timestep, HostModel(host), substeps
     )
-    reach = np.concatenate([_joint_reach(host), np.full(host.nv, 5.0), np.ones(host.na)])
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
@@ -446,7 +452,7 @@ def from_mjcf(
             terminal_constraint=terminal_constraint,
             x_init=jnp.asarray(x0),
             bounds=bounds,
-            scatter=scatter_box(bounds, jnp.asarray(x0), jnp.asarray(reach), x_scatter, u_scatter),
+            scatter=_scatter(dynamics, bounds, x0, x_scatter, u_scatter),
             aside=Aside(goal, guess, name),
             horizon=knots(horizon, dynamics.dt),
         )
@@ -505,11 +511,40 @@ def _initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -
     return x0
 
 
-def _joint_reach(model: mujoco.MjModel) -> np.ndarray:
-    """Half-widths (nq,) of the scatter of positions: pi for hinges, 1 for all else."""
-    reach = np.ones(model.nq)
-    reach[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = np.pi
-    return reach
+def _reach(model: mujoco.MjModel) -> np.ndarray:
+    """Half-widths (nx,) of the scatter of states."""
+    positions = np.ones(model.nq)
+    positions[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = np.pi
+    positions[Joints.of(model).is_quaternion] = 0.3
+    return np.concatenate([positions, np.full(model.nv, 5.0), np.ones(model.na)])
+
+
+def _scatter(
+    dynamics: MjxDynamics,
+    bounds: Box,
+    x_init: np.ndarray,
+    x: tuple[ArrayLike, ArrayLike] | None,
+    u: tuple[ArrayLike, ArrayLike] | None,
+) -> Box:
+    """The box that initial knots are drawn from."""
+    model, reach = dynamics.mj_model, _reach(dynamics.mj_model)
+    if dynamics.kinked:  # far from x_init, bodies overlap, and forces are without measure
+        from mjx_drax.guesses import controls, middle
+
+        rest = middle(bounds)
+        hold = controls(model, np.stack([x_init, x_init]), dynamics.dt, rest)[0]
+        u_lower, u_upper = (np.asarray(end, float) for end in (bounds.u_lower, bounds.u_upper))
+        width = CLOSE * np.where(np.isfinite(u_upper - u_lower), u_upper - u_lower, 1.0)
+        x_lower, x_upper = (np.asarray(end, float) for end in (bounds.x_lower, bounds.x_upper))
+        near = np.clip([x_init - CLOSE * reach, x_init + CLOSE * reach], x_lower, x_upper)
+        x = (near[0], near[1]) if x is None else x
+        hold = np.clip(hold, u_lower, u_upper)
+        u = (
+            (np.maximum(hold - width, u_lower), np.minimum(hold + width, u_upper))
+            if u is None
+            else u
+        )
+    return scatter_box(bounds, jnp.asarray(x_init), jnp.asarray(reach), x, u)
 
 
 def _bounded(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:

@@ -225,7 +225,8 @@ class _Search:
         clock = time.perf_counter()
         self.records.append((0, info))
         kept, complete = self._attempt(first, state, info, total)
-        kept = self._mended(first, kept, total)
+        if complete:
+            kept, complete = self._mended(first, kept, total)
         for attempt in range(1, solver.attempts):
             left = np.flatnonzero(~_finished(kept, solver.within, unit))
             if not complete or len(left) <= (1.0 - solver.enough) * self.chains:
@@ -237,7 +238,8 @@ class _Search:
                 flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
             try:
                 found, complete = self._attempt(flow, *self._start(flow, attempt), total)
-                found = self._mended(flow, found, total)
+                if complete:
+                    found, complete = self._mended(flow, found, total)
                 kept = _best(kept, found, owners)
             except KeyboardInterrupt:  # between two attempts
                 break
@@ -251,8 +253,8 @@ class _Search:
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
         return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
 
-    def _mended(self, flow: Langevin, kept: Attempt, expected: int) -> Attempt:
-        """The attempt, its chains led on along replays where f has kinks.
+    def _mended(self, flow: Langevin, kept: Attempt, expected: int) -> tuple[Attempt, bool]:
+        """The attempt, its chains led on along replays where f has kinks; and if uninterrupted.
 
         Where contacts switch, linear models of f are wrong, and steps that trust them leave
         defects. A replay has none. So each chain takes its replay, and then every two steps of the
@@ -260,34 +262,38 @@ class _Search:
         which it is not are damped more.
         """
         if not self.problem.dynamics.kinked or kept.feasible.all() or flow.tail < STEPS:
-            return kept
-        everyone, total = np.arange(self.chains), flow.iterations + flow.tail
-        for with_feedback in (0.0, 1.0):
-            kept = _best(kept, self._replayed(flow, kept, with_feedback), everyone)
-        damping = np.ones(self.chains)
-        for _ in range(MENDINGS):
-            state = replace(kept.state, damping=jnp.asarray(damping, kept.state.damping.dtype))
-            state, info = _advance(flow, self.problem, state, total - STEPS, total, True)
-            self.done += STEPS
-            tried = Attempt(state, info, np.full(self.chains, self.done))
-            replayed = self._replayed(flow, tried, 1.0)
-            before = np.asarray(kept.info.cost), kept.feasible
-            kept = _best(_best(kept, tried, everyone), replayed, everyone)
-            cheaper = np.asarray(kept.info.cost) < before[0] * (1 - 1e-3)
-            improved = cheaper | (kept.feasible & ~before[1])
-            damping = np.clip(damping * np.where(improved, EASE, TIGHTEN), *DAMPING)
-            self.records.append((self.done, kept.info))
-            if self.progress is not None:
-                self.progress(self.done, max(self.done, expected), kept.info)
-            print(
-                "mend",
-                kept.feasible.mean(),
-                improved.mean(),
-                np.sort(np.asarray(kept.info.cost)[kept.feasible])[:4],
-            )
-            if not improved.any() and (damping >= DAMPING[1]).all():
-                break
-        return kept
+            return kept, True
+        everyone = np.arange(self.chains)
+        try:
+            for with_feedback in (0.0, 1.0):
+                kept = _best(kept, self._replayed(flow, kept, with_feedback), everyone)
+            damping = np.ones(self.chains)
+            for _ in range(MENDINGS):
+                found = self._stepped(flow, kept, damping)
+                found = _best(found, self._replayed(flow, found, 1.0), everyone)
+                improved = _improved(kept, found)
+                kept = _best(kept, found, everyone)
+                damping = np.clip(damping * np.where(improved, EASE, TIGHTEN), *DAMPING)
+                self._report(kept.info, expected)
+                if not improved.any() and (damping == DAMPING[1]).all():
+                    break
+        except KeyboardInterrupt:
+            return kept, False
+        return kept, True
+
+    def _stepped(self, flow: Langevin, kept: Attempt, damping: np.ndarray) -> Attempt:
+        """The attempt after the last `STEPS` of the tail's iterations, once more."""
+        total = flow.iterations + flow.tail
+        state = replace(kept.state, damping=jnp.asarray(damping, kept.state.damping.dtype))
+        state, info = _advance(flow, self.problem, state, total - STEPS, total, True)
+        self.done += STEPS
+        return Attempt(state, info, np.full(self.chains, self.done))
+
+    def _report(self, info: Info, expected: int) -> None:
+        """Record where the chains are, and tell."""
+        self.records.append((self.done, info))
+        if self.progress is not None:
+            self.progress(self.done, max(expected, self.done), info)
 
     def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float) -> Attempt:
         """Every chain's knots replaced by a replay of its controls."""
@@ -300,7 +306,8 @@ class _Search:
             (np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)),
         )
         replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
-        state, info = _moved_to(flow, problem, kept.state, replayed)
+        state = _moved_to(flow, problem, kept.state, replayed)
+        state, info = _advance(flow, problem, state, 0, 0, True)  # compiled already; just evaluates
         return Attempt(state, info, np.full(self.chains, self.done))
 
     def _attempt(
@@ -315,12 +322,10 @@ class _Search:
                 ahead = _advance(flow, self.problem, state, done, stop, tail)
                 (state, info), done = jax.block_until_ready(ahead), stop
                 self.done = before + done
-                self.records.append((self.done, info))
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 converged_at = np.where(feasible & (converged_at < 0), self.done, converged_at)
                 converged_at = np.where(feasible, converged_at, -1)
-                if self.progress is not None:
-                    self.progress(self.done, expected, info)
+                self._report(info, expected)
         except KeyboardInterrupt:  # the chains as they were at the last report
             return Attempt(state, info, converged_at), False
         return Attempt(state, info, converged_at), True
@@ -335,13 +340,7 @@ def _advance(
     return state, evaluate(problem, state.trajectory)
 
 
-@jax.jit
-def _moved_to(
-    flow: Langevin, problem: Problem, state: State, knots: Trajectory
-) -> tuple[State, Info]:
-    """`Langevin.moved_to` and `evaluate` in one launch."""
-    state = flow.moved_to(problem, state, knots)
-    return state, evaluate(problem, state.trajectory)
+_moved_to = jax.jit(Langevin.moved_to)
 
 
 @jax.jit
@@ -381,6 +380,13 @@ def _finished(kept: Attempt, within: float, unit: float) -> np.ndarray:
     if not np.isfinite(best):
         return kept.feasible
     return costs <= best + max(within * abs(best), NEGLIGIBLE * unit)
+
+
+def _improved(kept: Attempt, found: Attempt) -> np.ndarray:
+    """Which chains became feasible, or cheaper by more than a thousandth, (chains,)."""
+    before, after = (np.asarray(a.info.cost, float) for a in (kept, found))
+    cheaper = after < before - 1e-3 * np.abs(before)
+    return found.feasible & (cheaper | ~kept.feasible)
 
 
 def _best(kept: Attempt, found: Attempt, owners: np.ndarray) -> Attempt:
