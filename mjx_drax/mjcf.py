@@ -42,9 +42,6 @@ from mjx_drax.problem import (
 from mjx_drax.scalar import scalarized
 from mjx_drax.twin import driven, has_constraints, twin
 
-CLOSE = 0.03
-"""Share of the usual scatter of initial knots that is left where f has kinks."""
-
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
 take several times as many, and compilers need minutes for tens of thousands."""
@@ -418,7 +415,7 @@ def from_mjcf(
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
             +-5 (rad/s or m/s) for velocities about x_init. Where contacts, limits or dry friction
-            act, the default is x_init +- `CLOSE` of this.
+            act, chains start nearer to x_init, some more than others: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: False plans as if nothing could touch, which is right where constraints keep
@@ -527,24 +524,17 @@ def _scatter(
     u: tuple[ArrayLike, ArrayLike] | None,
 ) -> Box:
     """The box that initial knots are drawn from."""
-    model, reach = dynamics.mj_model, _reach(dynamics.mj_model)
-    if dynamics.kinked:  # far from x_init, bodies overlap, and forces are without measure
+    model = dynamics.mj_model
+    if dynamics.kinked and u is None:  # about the controls that hold x_init
         from mjx_drax.guesses import controls, middle
 
-        rest = middle(bounds)
-        hold = controls(model, np.stack([x_init, x_init]), dynamics.dt, rest)[0]
-        u_lower, u_upper = (np.asarray(end, float) for end in (bounds.u_lower, bounds.u_upper))
-        width = CLOSE * np.where(np.isfinite(u_upper - u_lower), u_upper - u_lower, 1.0)
-        x_lower, x_upper = (np.asarray(end, float) for end in (bounds.x_lower, bounds.x_upper))
-        near = np.clip([x_init - CLOSE * reach, x_init + CLOSE * reach], x_lower, x_upper)
-        x = (near[0], near[1]) if x is None else x
-        hold = np.clip(hold, u_lower, u_upper)
-        u = (
-            (np.maximum(hold - width, u_lower), np.minimum(hold + width, u_upper))
-            if u is None
-            else u
-        )
-    return scatter_box(bounds, jnp.asarray(x_init), jnp.asarray(reach), x, u)
+        ends = np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)
+        width = np.where(np.isfinite(ends[1] - ends[0]), (ends[1] - ends[0]) / 2, 1.0)
+        hold = controls(model, np.stack([x_init, x_init]), dynamics.dt, middle(bounds))[0]
+        hold = np.clip(hold, *ends)
+        u = hold - width, hold + width
+    reach = jnp.asarray(_reach(model))
+    return scatter_box(bounds, jnp.asarray(x_init), reach, x, u)
 
 
 def _bounded(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:

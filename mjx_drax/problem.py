@@ -24,6 +24,9 @@ from mjx_drax.derivatives import Differentiator, positive_part
 from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
 from mjx_drax.errors import DraxError
 
+CLOSE = 0.03
+"""Smallest factor on the scatter of initial knots where f has kinks."""
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -289,7 +292,12 @@ class Problem:
         )
 
     def draw(self, key: Array) -> Trajectory:
-        """Random initial knots for one chain; they need not be feasible."""
+        """Random initial knots for one chain; they need not be feasible.
+
+        They are drawn from the scatter box. Where f has kinks, bodies overlap far from x_init, and
+        forces lose all measure. There the box is shrunk towards x_init and the middle of the
+        controls, for each chain by another factor from `CLOSE` to 1, uniform in its logarithm.
+        """
         if self.guess is not None:
             knots = self.guess(key)
             return replace(knots, x=self.dynamics.valid(jnp.asarray(knots.x)))
@@ -297,10 +305,13 @@ class Problem:
         box, dynamics = self.scatter, self.dynamics
         x = jax.random.uniform(key_x, (self.horizon, dynamics.nx))
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
-        return Trajectory(
-            dynamics.valid(box.x_lower + x * (box.x_upper - box.x_lower)),
-            box.u_lower + u * (box.u_upper - box.u_lower),
-        )
+        x = box.x_lower + x * (box.x_upper - box.x_lower)
+        u = box.u_lower + u * (box.u_upper - box.u_lower)
+        if dynamics.kinked:
+            share = CLOSE ** jax.random.uniform(jax.random.fold_in(key, 2))
+            middle = 0.5 * (box.u_lower + box.u_upper)
+            x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
+        return Trajectory(dynamics.valid(x), u)
 
     def reached(self, x: np.ndarray) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.

@@ -7,6 +7,9 @@ They start again from new random knots, are heated to a temperature of that scal
 slowly. Chains that are done leave their places in the batch to those that are not, so an attempt
 makes several tries for each, and every chain keeps the best that was found for it.
 
+Where f has kinks (contacts, limits, dry friction), noise was never seen to help, so all attempts
+descend; each is then led on along replays of its controls (`_Search._mended`).
+
 Schedules are multiples of units that are measured, so no setting depends on the units of a cost:
 
     cost     a share of the median cost of the initial knots, for mu, delta and rho; ten times as
@@ -57,6 +60,9 @@ MORE = 10.0
 
 MENDINGS, STEPS = 30, 2
 """Rounds of replays after an attempt, and iterations of the tail in each, where f has kinks."""
+
+ENOUGH = 0.25
+"""Largest share of chains to be done where f has kinks; attempts are long there."""
 
 NEGLIGIBLE = 0.03
 """Differences of cost below so many units do not count."""
@@ -211,6 +217,8 @@ class _Search:
     def run(self, solver: Restarts) -> Run:
         clock = time.perf_counter()
         flow, total = solver.flow, solver.iterations
+        kinked = self.problem.dynamics.kinked
+        enough = min(solver.enough, ENOUGH) if kinked else solver.enough
         if solver.descent is not None:
             flow = replace(flow, scale=_scale(1.0, 1.0))  # not yet known, but of that type
         state, info = self._start(flow, 0)
@@ -229,12 +237,14 @@ class _Search:
             kept, complete = self._mended(first, kept, total)
         for attempt in range(1, solver.attempts):
             left = np.flatnonzero(~_finished(kept, solver.within, unit))
-            if not complete or len(left) <= (1.0 - solver.enough) * self.chains:
+            if not complete or len(left) <= (1.0 - enough) * self.chains:
                 break
             owners = np.resize(left, self.chains)
             if not kept.feasible.any():
                 unit = MORE * unit  # the knots' cost says too little: penalize defects more
-            if solver.descent is not None:
+            if kinked:
+                flow = solver.first(unit)
+            elif solver.descent is not None:
                 flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
             try:
                 found, complete = self._attempt(flow, *self._start(flow, attempt), total)
