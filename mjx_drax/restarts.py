@@ -61,7 +61,7 @@ MORE = 10.0
 MENDINGS, STEPS = 30, 2
 """Rounds of replays after an attempt, and iterations of the tail in each, where f has kinks."""
 
-ENOUGH = 0.25
+ENOUGH = 0.1
 """Largest share of chains to be done where f has kinks; attempts are long there."""
 
 NEGLIGIBLE = 0.03

@@ -206,14 +206,16 @@ def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
 
 
 def driven(model: mujoco.MjModel) -> np.ndarray:
-    """Joints that an actuator pulls at in the default pose, (njnt,)."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    moment = np.zeros((model.nu, model.nv))
-    mujoco.mju_sparse2dense(
-        moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-    )
-    pulled = np.abs(moment).sum(axis=0) > 0
+    """Joints that an actuator pulls at in the default pose or another, (njnt,)."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    pulled = np.zeros(model.nv, bool)
+    for _ in range(3):
+        mujoco.mj_forward(model, data)
+        moment = np.zeros((model.nu, model.nv))
+        at = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(moment, data.actuator_moment, *at)
+        pulled |= np.abs(moment).sum(axis=0) > 0
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
     joints = np.zeros(model.njnt, bool)
     joints[model.dof_jntid[pulled]] = True
     return joints
