@@ -6,6 +6,6 @@ from mjx_drax import Problem
 from mjx_drax.tasks import car_bug_trap, deep_trap
 
 
-def make(horizon: float = 11.9) -> Problem:
+def make(horizon: float = 14.0) -> Problem:
     """From inside the trap to rest at the goal behind it."""
     return car_bug_trap.make(horizon, "car_deep_trap", deep_trap.WALL)

@@ -1,12 +1,15 @@
 """Descending first, heating what failed: nothing found is lost, and no setting depends on units."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import register_dataclass
 
 from mjx_drax import DraxError, Langevin, Restarts, from_function, from_program, minimize, restarts
+from mjx_drax.dynamics import FunctionDynamics
 from mjx_drax.langevin import Info, State
 from mjx_drax.restarts import Attempt, run
 from mjx_drax.solution import solve
@@ -146,3 +149,64 @@ def test_settings_that_are_refused(settings, words):
 def test_a_solver_of_another_kind_is_refused():
     with pytest.raises(DraxError, match="solver is 'ipopt': give a Langevin or a Restarts"):
         minimize(PROGRAM, chains=2, solver="ipopt")
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Bouncing(FunctionDynamics):
+    """A ball on a stiff floor: f has a kink where they touch."""
+
+    kinked = True
+
+
+@pytest.fixture(scope="module")
+def bouncing():
+    """A ball of 1 kg that bounces on a floor of 300 N/m, with a thrust of 3 N to help it up."""
+
+    def ball(x, u):
+        v = x[1] + 0.05 * (u[0] - 9.81 + 300.0 * jnp.maximum(0.0, -x[0]))
+        return jnp.array([x[0] + 0.05 * v, v])
+
+    problem = from_function(
+        ball,
+        x_init=[1.0, 0.0],
+        nu=1,
+        dt=0.05,
+        horizon=2.0,
+        running_residual=lambda x, u: 0.1 * u,
+        terminal_residual=lambda x: 10.0 * (x - jnp.array([0.9, 0.0])),
+        u_bounds=(-3.0, 3.0),
+        x_scatter=([-0.5, -8.0], [1.5, 8.0]),
+        goal=lambda x: abs(x[0] - 0.9) < 0.1 and abs(x[1]) < 0.5,
+    )
+    dynamics = problem.dynamics
+    kinked = Bouncing(dynamics.function, dynamics.dt, dynamics.nx, dynamics.nu)
+    return problem, replace(problem, dynamics=kinked)
+
+
+def test_replays_lead_on_where_f_has_kinks(bouncing):
+    """The same dynamics with and without being told of the kink."""
+    plain, kinked = (solve(p, chains=16, solver=Restarts(attempts=1)) for p in bouncing)
+    assert not plain.feasible.any()
+    assert kinked.feasible.mean() > 0.9
+    assert kinked.certified
+    assert kinked.iterations > plain.iterations
+
+
+def test_interrupted_while_replays_lead_on_keeps_what_there_is(bouncing):
+    def stop(done, total, info):
+        if done > 170:  # the attempt took 160
+            raise KeyboardInterrupt
+
+    solution = solve(bouncing[1], chains=16, progress=stop)
+    assert 170 < solution.iterations < 220
+    assert solution.feasible.any()
+
+
+def test_chains_start_near_and_far_where_f_has_kinks(bouncing):
+    keys = jax.random.split(jax.random.key(0), 200)
+    near, far = (jax.vmap(p.draw)(keys).x - p.x_init for p in reversed(bouncing))
+    width = np.abs(near[..., 1]).max(axis=1)
+    assert np.abs(far[..., 1]).max(axis=1).min() > 6.0
+    assert 0.03 * 7.0 < width.min() < 0.05 * 8.0
+    assert 6.0 < width.max() <= 8.0
