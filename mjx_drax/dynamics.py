@@ -29,12 +29,14 @@ class Dynamics:
         ndx: numbers in a difference of states.
         nu: numbers in a control.
         dt: time between knots [s].
+        derivatives: how f is differentiated, if not as the solver would; see `derivatives`.
     """
 
     nx: int
     ndx: int
     nu: int
     dt: float
+    derivatives: Any = None
 
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u): the state (nx,) one knot after x (nx,) under the control u (nu,)."""

@@ -30,7 +30,7 @@ def linearize(
 ) -> Linearization:
     """The dynamics at every knot, with one random key for each, (K,)."""
     dynamics = problem.dynamics
-    ndx, by = dynamics.ndx, dynamics.differentiator(by)
+    ndx, by = dynamics.ndx, dynamics.derivatives or dynamics.differentiator(by)
 
     def stage(x: Array, u: Array, x_next: Array, key: Array) -> Linearization:
         def defect(dz: Array) -> Array:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from mjx_drax import physics
 from mjx_drax._mujoco import mujoco
-from mjx_drax.derivatives import Autodiff, InScalars
+from mjx_drax.derivatives import Autodiff, Differentiator, InScalars
 from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
 from mjx_drax.joints import Joints
@@ -123,6 +123,7 @@ class MjxDynamics(Dynamics):
         dt: time between knots [s], substeps times the model's timestep.
         host: the model for MuJoCo's C engine.
         substeps: physics steps in one control step.
+        derivatives: how f is differentiated; None: exactly.
         structure: what compiled functions know of the model, found when this is constructed.
     """
 
@@ -130,6 +131,7 @@ class MjxDynamics(Dynamics):
     dt: float
     host: HostModel
     substeps: int
+    derivatives: Differentiator | None = None
     structure: Structure = field(init=False)
 
     def __post_init__(self) -> None:
@@ -249,13 +251,13 @@ class MjxDynamics(Dynamics):
 
 def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     static = (dynamics.host, dynamics.substeps, dynamics.structure)
-    return (dynamics.model, dynamics.dt), static
+    return (dynamics.model, dynamics.dt, dynamics.derivatives), static
 
 
 def _unflatten(static: tuple[Any, ...], traced: Iterable[Any]) -> MjxDynamics:
     """The same dynamics inside a compiled function, where only the structure is known."""
     dynamics = object.__new__(MjxDynamics)
-    names = ("model", "dt", "host", "substeps", "structure")
+    names = ("model", "dt", "derivatives", "host", "substeps", "structure")
     for name, value in zip(names, (*traced, *static), strict=True):
         object.__setattr__(dynamics, name, value)
     return dynamics
@@ -386,6 +388,7 @@ def from_mjcf(
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     contacts: bool = True,
+    derivatives: Differentiator | None = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
     name: str | None = None,
@@ -420,6 +423,8 @@ def from_mjcf(
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: False plans as if nothing could touch, which is right where constraints keep
             things apart. The C engine that certifies keeps its contacts.
+        derivatives: of f; by default exact, also in contact. `Smoothed()` fits them to samples,
+            which feel a contact from as far as they are drawn.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
         guess: guess(key) -> Trajectory, instead of the scatter boxes.
         name: used in files and tables; by default the model's name.
@@ -434,7 +439,11 @@ def from_mjcf(
     x0 = _initial_state(host, name, x_init)
     bounded = _bounded(host, x0)
     dynamics = MjxDynamics(
-        twin(host, contacts, bounded), substeps * host.opt.timestep, HostModel(host), substeps
+        twin(host, contacts, bounded),
+        substeps * host.opt.timestep,
+        HostModel(host),
+        substeps,
+        derivatives,
     )
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
     constraint, terminal_constraint = constraints_of(
