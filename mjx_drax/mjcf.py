@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax import physics
+from mjx_drax import agreement, physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, InScalars
 from mjx_drax.dynamics import Dynamics
@@ -434,6 +434,8 @@ def from_mjcf(
     )
     reach = np.concatenate([_joint_reach(host), np.full(host.nv, 5.0), np.ones(host.na)])
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
+    ends = np.asarray(bounds.x_lower, float), np.asarray(bounds.x_upper, float)
+    agreement.require(host, name, x0, ends, contacts, bounded)
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
     )

@@ -50,7 +50,18 @@ def twin(
         raise DraxError(_refusal(mended, str(error))) from error
     # MJX commits its arrays to a device. What is computed from them is then committed as well, and
     # a loop that is fed its own output would be compiled a second time.
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device)
+    return _with_springs(jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device))
+
+
+def _with_springs(model: mjx.Model) -> mjx.Model:
+    """The model, whose tendon springs have a derivative at rest too.
+
+    MJX finds no force in a tendon that is neither longer nor shorter than its spring, and so no
+    stiffness either. Now it is longer, by the last digit.
+    """
+    lower, upper = model.tendon_lengthspring.T
+    upper = jnp.where(lower == upper, jnp.nextafter(upper, -jnp.inf), upper)
+    return model.replace(tendon_lengthspring=jnp.stack([lower, upper], axis=1))
 
 
 def _mend(model: mujoco.MjModel) -> None:
@@ -61,16 +72,19 @@ def _mend(model: mujoco.MjModel) -> None:
     if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
         opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
-    # With one of the two flags set, MJX leaves out all passive forces
     springs, dampers = int(_DISABLE.mjDSBL_SPRING), int(_DISABLE.mjDSBL_DAMPER)
+    if opt.disableflags & springs:
+        model.jnt_stiffness[:] = 0.0
+        model.tendon_stiffness[:] = 0.0
+    if opt.disableflags & dampers:
+        model.dof_damping[:] = 0.0
+        model.tendon_damping[:] = 0.0
     if not (opt.disableflags & springs and opt.disableflags & dampers):
-        if opt.disableflags & springs:
-            model.jnt_stiffness[:] = 0.0
-            model.tendon_stiffness[:] = 0.0
-        if opt.disableflags & dampers:
-            model.dof_damping[:] = 0.0
-            model.tendon_damping[:] = 0.0
+        # With one of the two flags set, MJX leaves out all passive forces; MuJoCo, with both
         opt.disableflags &= ~(springs | dampers)
+    if opt.disableflags & _DISABLE.mjDSBL_CONTACT:  # else MJX refuses what it cannot collide
+        model.geom_contype[:] = 0
+        model.geom_conaffinity[:] = 0
     silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
     model.actuator_gainprm[silent] = 0.0
     model.actuator_biasprm[silent] = 0.0
