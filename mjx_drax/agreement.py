@@ -19,7 +19,7 @@ from mjx_drax import physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError, DraxWarning
 from mjx_drax.joints import Joints
-from mjx_drax.twin import differences, twin
+from mjx_drax.twin import differences, free_ranges, twin
 
 WRONG, NOTICEABLE = 1e-2, 1e-6
 """One-step errors of velocities [rad/s, m/s] above which a model is refused, or warned of."""
@@ -95,26 +95,26 @@ class Engine:
         return np.stack([moved(e) - moved(-e) for e in nudges], axis=1) / (2 * eps)
 
 
-def probes(
-    engine: Engine, x_init: np.ndarray, lower: np.ndarray, upper: np.ndarray, seed: int = 0
-) -> Probes:
+def probes(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int = 0) -> Probes:
     """x_init, a state near it, and states along a motion under constant random controls.
 
     Args:
         engine: which makes the motion.
         x_init: (nx,).
-        lower, upper: bounds on states, (nx,), that they are clipped to.
+        bounded: joints whose positions are clipped to their ranges, (njnt,).
         seed: of the random numbers.
     """
     model, rng = engine.model, np.random.default_rng(seed)
     ranges = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0])
     nv, scale = model.nv, np.zeros(2 * model.nv + model.na)
     scale[:nv], scale[nv : 2 * nv] = NUDGE, SPEED
-    u = rng.uniform(*ranges.T, (2 + len(MOMENTS), model.nu))
+    u = rng.uniform(ranges[:, 0], ranges[:, 1], (2 + len(MOMENTS), model.nu))
     x = [x_init, engine.integrate(x_init, scale * rng.normal(size=scale.shape))]
     for moment, control in zip(MOMENTS, u[2:], strict=True):
         x.append(engine.step(x_init, control, max(1, round(moment / model.opt.timestep))))
-    states = np.clip(np.stack(x), lower, upper)
+    states, where = np.stack(x), model.jnt_qposadr[bounded]
+    lower, upper = free_ranges(model)
+    states[:, where] = np.clip(states[:, where], lower[bounded], upper[bounded])
     usable = np.isfinite(states).all(axis=1)
     return Probes(states[usable], u[usable])
 
@@ -172,7 +172,6 @@ def require(
     model: mujoco.MjModel,
     name: str,
     x_init: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
     contacts: bool,
     bounded: np.ndarray,
 ) -> None:
@@ -186,7 +185,7 @@ def require(
     found = differences(model, contacts)
     if not found:
         return
-    at = probes(Engine(model, contacts), x_init, *bounds)
+    at = probes(Engine(model, contacts), x_init, bounded)
     error = float(np.max(compare(model, at, contacts, bounded).velocity))
     words = (
         f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "

@@ -219,20 +219,34 @@ def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
     return found
 
 
-def driven(model: mujoco.MjModel) -> np.ndarray:
-    """Joints that an actuator pulls at in the default pose, (njnt,)."""
+def moments(model: mujoco.MjModel) -> np.ndarray:
+    """Of a unit of every actuator's force, the force on every velocity in qpos0, (nu, nv)."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     moment = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(
         moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
     )
-    pulled = np.abs(moment).sum(axis=0) > 0
+    return moment
+
+
+def driven(model: mujoco.MjModel) -> np.ndarray:
+    """Joints that an actuator pulls at in the default pose, (njnt,)."""
     joints = np.zeros(model.njnt, bool)
-    joints[model.dof_jntid[pulled]] = True
+    joints[model.dof_jntid[np.abs(moments(model)).sum(axis=0) > 0]] = True
     return joints
+
+
+def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
+    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
+
+
+def constraint_rows(model: mjx.Model) -> int:
+    """Rows that constraint forces are solved for in a step, whether they are active or not."""
+    return int(jax.eval_shape(mjx.make_data, model)._impl.efc_J.shape[0])
 
 
 def has_constraints(model: mjx.Model) -> bool:
     """Whether a step of the model solves for constraint forces."""
-    return bool(jax.eval_shape(mjx.make_data, model)._impl.efc_J.size)
+    return constraint_rows(model) > 0

@@ -1,4 +1,4 @@
-"""States with quaternions: MuJoCo's own conventions, inverses, and derivatives that hold at rest."""
+"""States with quaternions: MuJoCo's conventions, inverses, and derivatives that hold at rest."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def drawn(seed, turn=2.0):
 
 
 def test_the_places_of_quaternions():
-    assert JOINTS == Joints(13, 11, ((1, 1), (9, 8)))
+    assert (JOINTS.nq, JOINTS.nv, JOINTS.quaternions) == (13, 11, ((1, 1), (9, 8)))
     np.testing.assert_array_equal(np.flatnonzero(JOINTS.is_quaternion), [1, 2, 3, 4, 9, 10, 11, 12])
 
 

@@ -249,7 +249,7 @@ STILL = '<mujoco model="rock"><worldbody><geom size="1"/></worldbody></mujoco>'
         (arm(joint='range="-90 90" limited="true" margin="0.1"'), (5, 5), False),
         (arm(joint='range="-1 1" limited="true"', actuator=MOTOR), (4, 4), True),
     ],
-    ids="plain free ball contact equality friction tendon margin passive".split(),
+    ids=["plain", "free", "ball", "contact", "equal", "friction", "tendon", "margin", "passive"],
 )
 def test_models_that_are_built(model, sizes, kinked):
     dynamics = problem(model).dynamics
@@ -301,7 +301,7 @@ def test_bounds_of_quaternions_are_refused(side):
 
 def test_quaternions_of_x_init_have_length_1():
     x = np.zeros(12)
-    with pytest.raises(DraxError, match="x_init holds the quaternion .* at 2: scale it"):
+    with pytest.raises(DraxError, match=r"x_init holds the quaternion .* at 2: scale it"):
         problem(arm(world=BALL), x_init=x)
     x[2:6] = [0.6, 0.0, 0.8001, 0.0]
     seen = problem(arm(world=BALL), x_init=x).x_init

@@ -87,7 +87,7 @@ def at(model, **parts):
     return np.concatenate([data.qpos, data.qvel, data.act])
 
 
-TUMBLING = {i: v for i, v in enumerate([0.3, -0.2, -0.4, 1.0, -2.0, 0.5, 0.7, -1.0, 0.4, 1.5])}
+TUMBLING = dict(enumerate([0.3, -0.2, -0.4, 1.0, -2.0, 0.5, 0.7, -1.0, 0.4, 1.5]))
 STATES = {
     FLOATING: {
         "rest in contact": {},

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, from_mjcf
-from mjx_drax.agreement import Engine, Probes, compare
+from mjx_drax.agreement import Probes, compare
 from mjx_drax.errors import DraxWarning
 from mjx_drax.twin import contact_pairs, differences, driven, has_constraints, twin
 
@@ -32,10 +32,9 @@ CHAIN = """
   </actuator>
   {more}
 </mujoco>"""
-NOTHING = {
-    name: ""
-    for name in "option before floors joint links motor actuator more".split()
-} | {"flag": 'contact="enable"', "floor": "plane", "link": "capsule"}  # fmt: skip
+FREE = ["option", "before", "floors", "joint", "links", "motor", "actuator", "more"]
+NOTHING = dict.fromkeys(FREE, "") | {"flag": 'contact="enable"'}
+NOTHING |= {"floor": "plane", "link": "capsule"}
 
 
 def chain(**parts):
@@ -100,7 +99,6 @@ def test_tendon_springs_have_stiffness_at_rest():
 
 
 MUSCLE = 'dyntype="user" joint="one"'
-SURFACES = 'elevation="0 1 1 0" nrow="2" ncol="2" size="1 1 1 0.1"'
 
 
 @pytest.mark.parametrize(
@@ -125,7 +123,7 @@ SURFACES = 'elevation="0 1 1 0" nrow="2" ncol="2" size="1 1 1 0.1"'
             "flex",
         ),
     ],
-    ids="collision condim transmission dynamics flag flex".split(),
+    ids=["collision", "condim", "transmission", "dynamics", "flag", "flex"],
 )
 def test_what_is_refused_says_why_and_what_to_do(parts, words):
     with pytest.raises(DraxError, match=words):
