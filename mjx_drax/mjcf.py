@@ -527,7 +527,7 @@ def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
     single = np.isin(model.jnt_type, [int(kind) for kind in kinds]) & (model.jnt_limited != 0)
     start = x_init[model.jnt_qposadr]
     lower, upper = free_ranges(model)
-    return single & driven(model) & (start >= lower) & (start <= upper)
+    return single & driven(model) & (start > lower) & (start < upper)
 
 
 def _bounds(

@@ -29,8 +29,9 @@ from mjx_drax.twin import free_ranges
 NEAR = 0.02
 """Largest |qpos - posture|, in tangent space [rad, m], that reaches it."""
 
-SHORTEST, NODES, DRAWS = 5, 4, 20
-"""Knots of a motion at least; random controls that each is led through; motions that are tried."""
+SHORTEST, NODES, DRAWS, SHRINK = 5, 4, 20, 0.7
+"""Knots of a motion at least; random controls that each is led through; motions that are tried, and
+what is left of the controls from each to the next."""
 
 
 def reach(
@@ -99,9 +100,9 @@ def _motion(
     bounded = bounded_joints(model, x_init)
     where = model.jnt_qposadr[bounded]
     lower, upper = (end[bounded] for end in free_ranges(model))
-    best = x_init[None]
-    for _ in range(DRAWS):
-        nodes = rng.uniform(*limits, (NODES, model.nu))
+    best, rest = x_init[None], np.clip(0.0, *limits)
+    for draw in range(DRAWS):
+        nodes = rest + SHRINK**draw * (rng.uniform(*limits, (NODES, model.nu)) - rest)
         at = np.linspace(0, NODES - 1, knots)
         controls = [np.interp(at, np.arange(NODES), column) for column in nodes.T]
         path = [x_init]

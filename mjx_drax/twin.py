@@ -82,7 +82,8 @@ def _mend(model: mujoco.MjModel) -> None:
     if not (opt.disableflags & springs and opt.disableflags & dampers):
         # With one of the two flags set, MJX leaves out all passive forces; MuJoCo, with both
         opt.disableflags &= ~(springs | dampers)
-    if opt.disableflags & _DISABLE.mjDSBL_CONTACT:  # else MJX refuses what it cannot collide
+    if opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+        # Otherwise MJX refuses what it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
     silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
