@@ -85,6 +85,17 @@ def _parser() -> argparse.ArgumentParser:
     listing = commands.add_parser("list", help="list the tasks")
     listing.set_defaults(run=_list)
 
+    checking = commands.add_parser(
+        "check",
+        help="what becomes of a model of your own, and whether MJX computes it as MuJoCo does",
+        description="Say what becomes of a model's joints, actuators and contacts, and how far one "
+        "step of MJX and its derivatives are from MuJoCo's C engine. The exit status is 0 if the "
+        "model can be used.",
+    )
+    checking.add_argument("model", metavar="XML", help="MJCF file")
+    checking.add_argument("--json", action="store_true", help="the same as JSON")
+    checking.set_defaults(run=_check)
+
     solving = commands.add_parser(
         "solve",
         help="solve a task, or a model and cost of your own",
@@ -160,6 +171,21 @@ def _list(options: argparse.Namespace) -> int:
     for name in tasks.names():
         print(f"{name:{width}}  {tasks.summary(name)}")
     return 0
+
+
+def _check(options: argparse.Namespace) -> int:
+    import json
+
+    from mjx_drax import check
+
+    _cache_compilations()
+
+    def progress(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    report = check.check(options.model, progress)
+    say(json.dumps(report, indent=1) if options.json else check.text(report))
+    return 0 if report["obstacle"] is None else 1
 
 
 def _solve(options: argparse.Namespace) -> int:

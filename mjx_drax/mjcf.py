@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax import physics
+from mjx_drax import agreement, physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, Differentiator, InScalars
 from mjx_drax.dynamics import Dynamics
@@ -40,7 +40,7 @@ from mjx_drax.problem import (
     vector,
 )
 from mjx_drax.scalar import scalarized
-from mjx_drax.twin import driven, has_constraints, twin
+from mjx_drax.twin import driven, free_ranges, has_constraints, twin
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
@@ -365,7 +365,7 @@ def index(model: mujoco.MjModel, kind: str, name: str) -> int:
     names = [element(i).name for i in range(getattr(model, _COUNTS[kind]))]
     if not isinstance(name, str) or not name or name not in names:
         known = ", ".join(repr(n) for n in names if n) or "no named one"
-        raise DraxError(f"{_model_name(model)} has no {kind} {name!r}: there is {known}.")
+        raise DraxError(f"{model_name(model)} has no {kind} {name!r}: there is {known}.")
     return names.index(name)
 
 
@@ -431,13 +431,16 @@ def from_mjcf(
 
     Raises:
         DraxError: the model cannot be used (saying which element and why), or arguments misfit.
+
+    Warns:
+        DraxWarning: MJX computes the model a little differently from the C engine.
     """
     host = load(model)
-    name = name or str(_model_name(host))
-    _refuse(host, name)
-    substeps = _substeps(host, dt)
-    x0 = _initial_state(host, name, x_init)
-    bounded = _bounded(host, x0)
+    name = name or str(model_name(host))
+    require_movable(host, name)
+    substeps = steps_between_knots(host, dt)
+    x0 = initial_state(host, name, x_init)
+    bounded = bounded_joints(host, x0)
     dynamics = MjxDynamics(
         twin(host, contacts, bounded),
         substeps * host.opt.timestep,
@@ -446,6 +449,7 @@ def from_mjcf(
         derivatives,
     )
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
+    agreement.require(host, name, x0, contacts, bounded)
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
     )
@@ -465,11 +469,12 @@ def from_mjcf(
     )
 
 
-def _model_name(model: mujoco.MjModel) -> str:
+def model_name(model: mujoco.MjModel) -> str:
+    """What the model calls itself."""
     return model.names[: model.names.index(b"\0")].decode() or "model"
 
 
-def _substeps(model: mujoco.MjModel, dt: float | None) -> int:
+def steps_between_knots(model: mujoco.MjModel, dt: float | None) -> int:
     """Physics steps in a control step of dt [s], which must be a multiple of the timestep."""
     timestep = model.opt.timestep
     if dt is None:
@@ -485,7 +490,7 @@ def _substeps(model: mujoco.MjModel, dt: float | None) -> int:
     return substeps
 
 
-def _refuse(model: mujoco.MjModel, name: str) -> None:
+def require_movable(model: mujoco.MjModel, name: str) -> None:
     """Raise a DraxError for a model that no trajectory can be planned for."""
     if model.nv == 0:
         raise DraxError(f"{name} has no joints: there is nothing to move.")
@@ -493,7 +498,7 @@ def _refuse(model: mujoco.MjModel, name: str) -> None:
         raise DraxError(f"{name} has no actuators: add an <actuator>.")
 
 
-def _initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
+def initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
     """x_0 (nx,) as given, or the first keyframe, or the default pose at rest."""
     if x_init is not None:
         x0 = np.asarray(vector("x_init", x_init), float)
@@ -546,7 +551,7 @@ def _scatter(
     return scatter_box(bounds, jnp.asarray(x_init), reach, x, u)
 
 
-def _bounded(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
+def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
     """Joints whose range becomes a bound on knots, (njnt,).
 
     Those are hinges and slides that an actuator drives and that start inside their range. What
@@ -555,13 +560,8 @@ def _bounded(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
     kinds = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
     single = np.isin(model.jnt_type, [int(kind) for kind in kinds]) & (model.jnt_limited != 0)
     start = x_init[model.jnt_qposadr]
-    lower, upper = _ranges(model)
-    return single & driven(model) & (start >= lower) & (start <= upper)
-
-
-def _ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
-    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
+    lower, upper = free_ranges(model)
+    return single & driven(model) & (start > lower) & (start < upper)
 
 
 def _bounds(
@@ -574,7 +574,7 @@ def _bounds(
     """The ranges of the model's joints and controls, intersected with the user's."""
     x_lower, x_upper = np.full(dynamics.nx, -np.inf), np.full(dynamics.nx, np.inf)
     where = model.jnt_qposadr[bounded]
-    x_lower[where], x_upper[where] = (end[bounded] for end in _ranges(model))
+    x_lower[where], x_upper[where] = (end[bounded] for end in free_ranges(model))
     u_lower, u_upper = np.full(model.nu, -np.inf), np.full(model.nu, np.inf)
     limited = model.actuator_ctrllimited.astype(bool)
     u_lower[limited], u_upper[limited] = model.actuator_ctrlrange[limited].T

@@ -50,7 +50,18 @@ def twin(
         raise DraxError(_refusal(mended, str(error))) from error
     # MJX commits its arrays to a device. What is computed from them is then committed as well, and
     # a loop that is fed its own output would be compiled a second time.
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device)
+    return _with_springs(jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device))
+
+
+def _with_springs(model: mjx.Model) -> mjx.Model:
+    """The model, whose tendon springs have a derivative at rest too.
+
+    MJX finds no force in a tendon that is neither longer nor shorter than its spring, and so no
+    stiffness either. Now it is longer, by the last digit.
+    """
+    lower, upper = model.tendon_lengthspring.T
+    upper = jnp.where(lower == upper, jnp.nextafter(upper, -jnp.inf), upper)
+    return model.replace(tendon_lengthspring=jnp.stack([lower, upper], axis=1))
 
 
 def _mend(model: mujoco.MjModel) -> None:
@@ -61,16 +72,20 @@ def _mend(model: mujoco.MjModel) -> None:
     if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
         opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
-    # With one of the two flags set, MJX leaves out all passive forces
     springs, dampers = int(_DISABLE.mjDSBL_SPRING), int(_DISABLE.mjDSBL_DAMPER)
+    if opt.disableflags & springs:
+        model.jnt_stiffness[:] = 0.0
+        model.tendon_stiffness[:] = 0.0
+    if opt.disableflags & dampers:
+        model.dof_damping[:] = 0.0
+        model.tendon_damping[:] = 0.0
     if not (opt.disableflags & springs and opt.disableflags & dampers):
-        if opt.disableflags & springs:
-            model.jnt_stiffness[:] = 0.0
-            model.tendon_stiffness[:] = 0.0
-        if opt.disableflags & dampers:
-            model.dof_damping[:] = 0.0
-            model.tendon_damping[:] = 0.0
+        # With one of the two flags set, MJX leaves out all passive forces; MuJoCo, with both
         opt.disableflags &= ~(springs | dampers)
+    if opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+        # Otherwise MJX refuses what it cannot collide
+        model.geom_contype[:] = 0
+        model.geom_conaffinity[:] = 0
     silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
     model.actuator_gainprm[silent] = 0.0
     model.actuator_biasprm[silent] = 0.0
@@ -205,22 +220,39 @@ def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
     return found
 
 
-def driven(model: mujoco.MjModel) -> np.ndarray:
-    """Joints that an actuator pulls at in the default pose or another, (njnt,)."""
+def moments(model: mujoco.MjModel) -> np.ndarray:
+    """Of a unit of every actuator's force, the largest force on every velocity, (nu, nv).
+
+    Over the default pose and two random ones, because what pulls at what depends on the pose.
+    """
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    pulled = np.zeros(model.nv, bool)
+    largest, moment = np.zeros((model.nu, model.nv)), np.zeros((model.nu, model.nv))
     for _ in range(3):
         mujoco.mj_forward(model, data)
-        moment = np.zeros((model.nu, model.nv))
         at = data.moment_rownnz, data.moment_rowadr, data.moment_colind
         mujoco.mju_sparse2dense(moment, data.actuator_moment, *at)
-        pulled |= np.abs(moment).sum(axis=0) > 0
+        largest = np.maximum(largest, np.abs(moment))
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+    return largest
+
+
+def driven(model: mujoco.MjModel) -> np.ndarray:
+    """Joints that an actuator pulls at in the default pose or another, (njnt,)."""
     joints = np.zeros(model.njnt, bool)
-    joints[model.dof_jntid[pulled]] = True
+    joints[model.dof_jntid[moments(model).sum(axis=0) > 0]] = True
     return joints
+
+
+def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
+    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
+
+
+def constraint_rows(model: mjx.Model) -> int:
+    """Rows that constraint forces are solved for in a step, whether they are active or not."""
+    return int(jax.eval_shape(mjx.make_data, model)._impl.efc_J.shape[0])
 
 
 def has_constraints(model: mjx.Model) -> bool:
     """Whether a step of the model solves for constraint forces."""
-    return bool(jax.eval_shape(mjx.make_data, model)._impl.efc_J.size)
+    return constraint_rows(model) > 0

@@ -139,3 +139,36 @@ def test_benchmark_prints_and_saves_rows(tmp_path, capsys):
     rows = json.loads((tmp_path / "benchmark.json").read_text())
     assert [(row["problem"], row["chains"]) for row in rows] == [("pendulum", 4)]
     assert f"{rows[0]['success_rate']:.1%}" in capsys.readouterr().out
+
+
+def test_check_says_what_becomes_of_a_model(own, capsys):
+    assert main(["check", str(own / "slider.xml")]) == 0
+    seen = capsys.readouterr()
+    for words in (
+        "nq 1, nv 1, nu 1, na 0, ndx 2",
+        "0 rows, 0 pairs",
+        "timestep 0.01 s, dt 0.02 s, integrator EULER",
+        "slide: slide, range -1 to 1 is a bound on knots, driven by actuator 0",
+        "actuator 0: motor on joint slide, control -1 to 1",
+    ):
+        assert words in seen.out
+    assert seen.out.endswith("CAN BE USED\n")
+    assert "compiling" in seen.err
+    assert main(["check", str(own / "slider.xml"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["agreement"]["velocity_error"] < 1e-12
+    assert report["agreement"]["jacobian_error_at_x_init"] < 1e-8
+    assert report["obstacle"] is None
+
+
+def test_check_says_what_stands_in_the_way(own, capsys):
+    model = own / "slider.xml"
+    model.write_text(SLIDER.replace('gear="10"', 'gear="10" armature="1"'))
+    assert main(["check", str(model)]) == 1
+    out = capsys.readouterr().out
+    assert "differs      actuators' own damping" in out
+    assert "CANNOT BE USED: one step of MJX differs" in out
+    model.write_text(SLIDER.split("<actuator>")[0] + "</mujoco>")
+    assert main(["check", str(model)]) == 1
+    assert "CANNOT BE USED: slider has no actuators" in capsys.readouterr().out
+    assert "no.xml" in error_of(capsys, "check", "no.xml")

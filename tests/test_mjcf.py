@@ -31,10 +31,8 @@ ARM = """
   <actuator>{actuator}</actuator>
   {more}
 </mujoco>"""
-MOTORS = (
-    '<motor joint="lift" ctrlrange="-2 3" ctrllimited="true"/>'
-    '<general joint="wrist" dyntype="filter" dynprm="0.1" gainprm="1"/>'
-)
+MOTOR = '<motor joint="lift" ctrlrange="-2 3" ctrllimited="true"/>'
+MOTORS = MOTOR + '<general joint="wrist" dyntype="filter" dynprm="0.1" gainprm="1"/>'
 
 
 def arm(joint="", world="", actuator=MOTORS, more="", contact=False):
@@ -231,7 +229,7 @@ def test_geoms_that_cannot_touch_are_no_reason_to_refuse():
 BALL = '<body><joint name="hip" type="ball"/><geom size="1"/></body>'
 FREE = '<body><freejoint name="base"/><geom size="1"/></body>'
 FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
-WELD = '<equality><joint joint1="lift" joint2="wrist"/></equality>'
+COUPLED = '<equality><joint joint1="lift" joint2="wrist"/></equality>'
 STRING = (
     '<tendon><fixed limited="true" range="0 1"><joint joint="wrist" coef="1"/></fixed></tendon>'
 )
@@ -239,20 +237,46 @@ STILL = '<mujoco model="rock"><worldbody><geom size="1"/></worldbody></mujoco>'
 
 
 @pytest.mark.parametrize(
+    ("model", "sizes", "kinked"),
+    [
+        (arm(), (5, 5), False),
+        (arm(world=FREE), (18, 17), False),
+        (arm(world=BALL), (12, 11), False),
+        (arm(world=FLOOR, contact=True), (5, 5), True),
+        (arm(more=COUPLED), (5, 5), True),
+        (arm(joint='frictionloss="0.1"'), (5, 5), True),
+        (arm(more=STRING), (5, 5), True),
+        (arm(joint='range="-90 90" limited="true" margin="0.1"'), (5, 5), False),
+        (arm(joint='range="-1 1" limited="true"', actuator=MOTOR), (4, 4), True),
+    ],
+    ids=["plain", "free", "ball", "contact", "equal", "friction", "tendon", "margin", "passive"],
+)
+def test_models_that_are_built(model, sizes, kinked):
+    dynamics = problem(model).dynamics
+    assert (dynamics.nx, dynamics.ndx) == sizes
+    assert dynamics.kinked is kinked
+
+
+def test_a_joint_that_starts_beyond_its_range_keeps_its_limit_in_the_dynamics():
+    task = problem(arm(), x_init=[0.3, 0, 0, 0, 0])
+    assert not np.isfinite(task.bounds.x_upper).any()
+    assert task.dynamics.kinked
+
+
+def test_margins_narrow_the_bounds_to_where_the_limit_has_no_force():
+    bounds = problem(arm(joint='range="-90 90" limited="true" margin="0.1"')).bounds
+    np.testing.assert_allclose(bounds.x_lower[:2], [-0.5, 0.1 - np.pi / 2])
+    np.testing.assert_allclose(bounds.x_upper[:2], [0.25, np.pi / 2 - 0.1])
+
+
+def test_contacts_can_be_left_out():
+    assert not problem(arm(world=FLOOR, contact=True), contacts=False).dynamics.kinked
+
+
+@pytest.mark.parametrize(
     ("model", "words"),
     [
-        (arm(world=FREE), "joint 'base' of arm is a free joint"),
-        (arm(world=BALL), "joint 'hip' of arm is a ball joint"),
-        (arm(world=FLOOR, contact=True), "'floor' and 'hand'.*contact"),
-        (
-            arm(more='<contact><pair geom1="hand" geom2="finger"/></contact>', contact=True),
-            "'hand'",
-        ),
-        (arm(more=WELD), "1 equality constraint"),
         (arm(actuator=""), "no actuators"),
-        (arm(joint='frictionloss="0.1"'), "friction"),
-        (arm(more=STRING), "friction or limited tendons"),
-        (arm(joint='range="-1 1" limited="true" margin="0.1"'), "margin"),
         (STILL, "rock has no joints"),
         ("nowhere.xml", "no model file 'nowhere.xml'"),
         (path("nowhere"), "no model file .*nowhere.xml"),
@@ -263,6 +287,25 @@ STILL = '<mujoco model="rock"><worldbody><geom size="1"/></worldbody></mujoco>'
 def test_models_that_are_refused(model, words):
     with pytest.raises(DraxError, match=words):
         problem(model)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_bounds_of_quaternions_are_refused(side):
+    ends = [np.full(12, -np.inf), np.full(12, np.inf)]
+    ends[side][3] = 0.5
+    with pytest.raises(
+        DraxError, match=r"x_bounds are finite at entries \[2, 3, 4, 5\].*inequality"
+    ):
+        problem(arm(world=BALL), x_bounds=tuple(ends))
+
+
+def test_quaternions_of_x_init_have_length_1():
+    x = np.zeros(12)
+    with pytest.raises(DraxError, match=r"x_init holds the quaternion .* at 2: scale it"):
+        problem(arm(world=BALL), x_init=x)
+    x[2:6] = [0.6, 0.0, 0.8001, 0.0]
+    seen = problem(arm(world=BALL), x_init=x).x_init
+    assert np.linalg.norm(seen[2:6]) == pytest.approx(1.0, abs=1e-6)
 
 
 def fails(data, *u):
@@ -286,7 +329,10 @@ def branches(data, *u):
         ({"horizon": 0.004}, "horizon is 0.004 s, shorter"),
         ({"x_init": [0.0, 0.0]}, r"x_init has 2 numbers; arm has 5: qpos \(2\)"),
         ({"x_init": np.zeros((2, 5))}, "(?s)x_init is .*give a vector"),
-        ({"x_init": [0.3, 0, 0, 0, 0]}, r"x_init = .*outside the bounds of x by 0.05"),
+        (
+            {"x_init": [0.2, 0, 0, 0, 0], "x_bounds": (-1, 0.15)},
+            r"x_init = .*outside the bounds of x by 0.05",
+        ),
         ({"x_init": [0, np.nan, 0, 0, 0]}, "x_init is .*nan.*finite"),
         ({"x_init": "down"}, "x_init is 'down'"),
         ({"x_bounds": (0.3, 1.0)}, "bounds of x cross at element 0: lower 0.3.*, upper 0.25"),

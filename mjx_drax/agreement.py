@@ -1,0 +1,197 @@
+"""How far the MJX twin of a model is from MuJoCo's C engine: one step, and its derivatives.
+
+Both take one physics step in float64 from the same states. What differs beyond rounding is what a
+plan will be wrong about, and what the certificate would find only after a solve.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax import physics
+from mjx_drax._mujoco import mujoco
+from mjx_drax.errors import DraxError, DraxWarning
+from mjx_drax.joints import Joints
+from mjx_drax.twin import differences, free_ranges, twin
+
+WRONG, NOTICEABLE = 1e-2, 1e-6
+"""One-step errors of velocities [rad/s, m/s] above which a model is refused, or warned of."""
+
+MOMENTS = (0.05, 0.2, 0.6)
+"""Times [s] of the states that the C engine is compared at, along a motion from x_init."""
+
+NUDGE, SPEED = 0.02, 0.5
+"""Spreads of the positions [rad, m] and velocities of a state near x_init."""
+
+
+@dataclass(frozen=True)
+class Probes:
+    """States (n, nx) and controls (n, nu) at which the engines are compared."""
+
+    x: np.ndarray
+    u: np.ndarray
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What a comparison found.
+
+    Attributes:
+        velocity: largest error of qvel after one step, (n,) [rad/s, m/s]; x_init comes first.
+        jacobian: largest error of an entry of [df/dx df/du] at x_init, in tangent space, relative
+            to the largest entry; NaN if it was not asked for.
+    """
+
+    velocity: np.ndarray
+    jacobian: float = np.nan
+
+
+class Engine:
+    """Single steps of the C engine, x = [qpos, qvel, act], with constraints solved to rounding."""
+
+    def __init__(self, model: mujoco.MjModel, contacts: bool = True) -> None:
+        self.model = copy.deepcopy(model)
+        self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
+        self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        if not contacts:
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+
+    def step(self, x: np.ndarray, u: np.ndarray, steps: int = 1) -> np.ndarray:
+        """The state (nx,) some steps after x (nx,) under u (nu,)."""
+        model, data = self.model, mujoco.MjData(self.model)
+        data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data, steps)
+        return np.concatenate([data.qpos, data.qvel, data.act])
+
+    def integrate(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        """x + dx for a tangent vector dx (2 nv + na,)."""
+        nq, nv = self.model.nq, self.model.nv
+        qpos = x[:nq].copy()
+        mujoco.mj_integratePos(self.model, qpos, dx[:nv], 1.0)
+        return np.concatenate([qpos, x[nq:] + dx[nv:]])
+
+    def difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """x - y in the tangent space at y, (2 nv + na,)."""
+        nq, off = self.model.nq, np.empty(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, off, 1.0, y[:nq], x[:nq])
+        return np.concatenate([off, x[nq:] - y[nq:]])
+
+    def jacobian(self, x: np.ndarray, u: np.ndarray, eps: float = 1e-6) -> np.ndarray:
+        """[df/dx df/du] (ndx, ndx + nu) by central differences in tangent space."""
+        reached, ndx = self.step(x, u), 2 * self.model.nv + self.model.na
+
+        def moved(dz: np.ndarray) -> np.ndarray:
+            return self.difference(self.step(self.integrate(x, dz[:ndx]), u + dz[ndx:]), reached)
+
+        nudges = eps * np.eye(ndx + self.model.nu)
+        return np.stack([moved(e) - moved(-e) for e in nudges], axis=1) / (2 * eps)
+
+
+def probes(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int = 0) -> Probes:
+    """x_init, a state near it, and states along a motion under constant random controls.
+
+    Args:
+        engine: which makes the motion.
+        x_init: (nx,).
+        bounded: joints whose positions are clipped to their ranges, (njnt,).
+        seed: of the random numbers.
+    """
+    model, rng = engine.model, np.random.default_rng(seed)
+    ranges = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0])
+    nv, scale = model.nv, np.zeros(2 * model.nv + model.na)
+    scale[:nv], scale[nv : 2 * nv] = NUDGE, SPEED
+    u = rng.uniform(ranges[:, 0], ranges[:, 1], (2 + len(MOMENTS), model.nu))
+    x = [x_init, engine.integrate(x_init, scale * rng.normal(size=scale.shape))]
+    for moment, control in zip(MOMENTS, u[2:], strict=True):
+        x.append(engine.step(x_init, control, max(1, round(moment / model.opt.timestep))))
+    states, where = np.stack(x), model.jnt_qposadr[bounded]
+    lower, upper = free_ranges(model)
+    states[:, where] = np.clip(states[:, where], lower[bounded], upper[bounded])
+    usable = np.isfinite(states).all(axis=1)
+    return Probes(states[usable], u[usable])
+
+
+def compare(
+    model: mujoco.MjModel,
+    at: Probes,
+    contacts: bool = True,
+    bounded: np.ndarray | None = None,
+    derivatives: bool = False,
+) -> Agreement:
+    """Compare one step of MJX with one of the C engine. Compiles the step.
+
+    Args:
+        model: which is not changed.
+        at: states, x_init first, and controls.
+        contacts, bounded: as for `twin`.
+        derivatives: whether to compare them as well, at x_init.
+
+    Raises:
+        DraxError: MJX does not support the model.
+    """
+    engine, joints, nv = Engine(model, contacts), Joints.of(model), model.nv
+    ndx = 2 * nv + model.na
+    with jax.enable_x64(True):
+        on_device = twin(model, contacts, bounded)
+
+        def reached(x: Array, u: Array) -> Array:
+            return physics.step(on_device, x, u)
+
+        def slope(x: Array, u: Array) -> tuple[Array, Array]:
+            end = reached(x, u)
+
+            def moved(dz: Array) -> Array:
+                near = reached(joints.integrate(x, dz[:ndx]), u + dz[ndx:])
+                return joints.difference(near, end)
+
+            return end, jax.jacfwd(moved)(jnp.zeros(ndx + model.nu))
+
+        x, u = jnp.asarray(at.x), jnp.asarray(at.u)
+        if derivatives:
+            ends, slopes = jax.tree.map(np.asarray, jax.jit(jax.vmap(slope))(x, u))
+        else:
+            ends = np.asarray(jax.jit(jax.vmap(reached))(x, u))
+    wanted = np.stack([engine.step(*pair) for pair in zip(at.x, at.u, strict=True)])
+    velocities = slice(model.nq, model.nq + nv)
+    error = np.abs(ends - wanted)[:, velocities].max(axis=1)
+    if not derivatives:
+        return Agreement(error)
+    exact = engine.jacobian(at.x[0], at.u[0])
+    return Agreement(error, float(np.abs(slopes[0] - exact).max() / np.abs(exact).max()))
+
+
+def require(
+    model: mujoco.MjModel,
+    name: str,
+    x_init: np.ndarray,
+    contacts: bool,
+    bounded: np.ndarray,
+) -> None:
+    """Refuse or warn of a model that MJX is known to compute differently, if it does so.
+
+    Only models with `differences` are compared, because that compiles their step.
+
+    Raises:
+        DraxError: velocities after one step differ by more than `WRONG`.
+    """
+    found = differences(model, contacts)
+    if not found:
+        return
+    at = probes(Engine(model, contacts), x_init, bounded)
+    error = float(np.max(compare(model, at, contacts, bounded).velocity))
+    words = (
+        f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
+        f"{name}: {'; '.join(found)}"
+    )
+    if not error <= WRONG:
+        raise DraxError(f"{words}.")
+    if error > NOTICEABLE:
+        warnings.warn(f"{words}.", DraxWarning, stacklevel=3)

@@ -1,0 +1,138 @@
+"""One step of MJX and its tangent-space Jacobian, against MuJoCo's C engine in float64.
+
+Few models that have many features each, because every one is compiled.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import from_mjcf
+from mjx_drax.agreement import Engine
+
+FLOATING = """
+<mujoco model="floating">
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body mocap="true" pos="0 0 3"><geom size="0.1" contype="0" conaffinity="0"/></body>
+    <body pos="0 0 0.0997">
+      <freejoint/>
+      <geom size="0.1" mass="1"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0.1" size="0.05" mass="0.3"
+            contype="0" conaffinity="0"/>
+      <site name="thruster" pos="0.1 0.1 0"/>
+      <body pos="0 0 0.2">
+        <joint type="ball" stiffness="2" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0.05 0.3" size="0.03" mass="0.2"
+              contype="0" conaffinity="0"/>
+        <body pos="0 0 0.3">
+          <joint name="flap" axis="1 0 0" range="-0.5 0.5" limited="true" frictionloss="0.05"/>
+          <geom size="0.03" pos="0 0.1 0.05" mass="0.1" contype="0" conaffinity="0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><general site="thruster" gear="0 0 1 0 0.1 0" dyntype="filter" dynprm="0.1"/></actuator>
+</mujoco>
+"""
+
+LINKED = """
+<mujoco model="linked">
+  <option timestep="0.005" integrator="RK4" cone="elliptic"/>
+  <worldbody>
+    <body>
+      <joint name="cart" type="slide" axis="1 0 0" armature="0.1"/>
+      <geom size="0.1" mass="1" contype="0" conaffinity="0"/>
+      <body pos="0 0 -0.2">
+        <joint name="upper" axis="0 1 0" damping="0.2" actuatorfrcrange="-1 1"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" contype="0" conaffinity="0"/>
+        <site name="elbow" pos="0.05 0 -0.3"/>
+        <body pos="0 0 -0.3">
+          <joint name="lower" axis="0 1 0" stiffness="0.5" springref="0.3"/>
+          <geom size="0.08" pos="0 0 -0.2" mass="0.4" condim="3"/>
+        </body>
+      </body>
+    </body>
+    <geom type="plane" size="1 1 1" pos="0 0 -0.775"/>
+    <site name="wall" pos="1 0 0"/>
+  </worldbody>
+  <tendon>
+    <fixed name="sum" limited="true" range="-0.2 0.2" frictionloss="0.02">
+      <joint joint="cart" coef="1"/><joint joint="upper" coef="0.5"/>
+    </fixed>
+    <spatial name="rope" stiffness="3" damping="0.3"><site site="wall"/><site site="elbow"/>
+    </spatial>
+  </tendon>
+  <equality><joint joint1="upper" joint2="lower" polycoef="0.1 1 0 0 0"/></equality>
+  <actuator>
+    <intvelocity joint="cart" kp="20" actrange="-1 1" ctrlrange="-2 2"/>
+    <position tendon="sum" kp="3" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def at(model, **parts):
+    """x = [qpos, qvel, act], the default pose at rest but for what is given."""
+    data = mujoco.MjData(model)
+    for name, values in parts.items():
+        for i, value in values.items():
+            getattr(data, name)[i] = value
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    return np.concatenate([data.qpos, data.qvel, data.act])
+
+
+TUMBLING = dict(enumerate([0.3, -0.2, -0.4, 1.0, -2.0, 0.5, 0.7, -1.0, 0.4, 1.5]))
+STATES = {
+    FLOATING: {
+        "rest in contact": {},
+        "rest in the air": {"qpos": {2: 1.0}},
+        "rotated, in flight": {
+            "qpos": {2: 1.0, 3: 0.5, 4: 0.5, 5: -0.5, 6: 0.5, 7: 0.6, 8: 0.8, 11: 0.1},
+            "qvel": TUMBLING,
+            "act": {0: 0.5},
+        },
+        "sliding": {"qvel": {**TUMBLING, 2: -0.1}},
+        "at a limit": {"qpos": {2: 1.0, 11: 0.51}, "qvel": {9: 0.1}},
+        "stuck by friction": {"qpos": {2: 1.0}, "qvel": {9: 1e-5}},
+    },
+    LINKED: {
+        "rest": {},
+        "moving": {"qpos": {0: 0.1, 1: 0.1, 2: 0.2}, "qvel": {0: 1.0, 1: -0.5, 2: 0.3}},
+        "tendon limit": {"qpos": {0: 0.19, 1: 0.05, 2: 0.1}, "act": {0: 0.3}},
+    },
+}
+
+
+@pytest.mark.parametrize("xml", STATES, ids=["floating", "linked"])
+def test_a_step_and_its_jacobian_are_the_c_engines(xml):
+    model = mujoco.MjModel.from_xml_string(xml)
+    engine = Engine(model)
+    control = np.array([1.0, 0.2])[: model.nu]
+    with jax.enable_x64(True):
+        task = from_mjcf(model, horizon=0.1, dt=model.opt.timestep, running_residual=lambda d, u: u)
+        dynamics, ndx = task.dynamics, task.dynamics.ndx
+
+        def moved(x, end, dz):
+            near = dynamics.step(dynamics.integrate(x, dz[:ndx]), control + dz[ndx:])
+            return dynamics.difference(near, end)
+
+        @jax.jit
+        def expanded(x):
+            end = dynamics.step(x, control)
+            return end, jax.jacfwd(partial(moved, x, end))(jnp.zeros(ndx + model.nu))
+
+        for name, parts in STATES[xml].items():
+            x = at(model, **parts)
+            end, jacobian = map(np.asarray, expanded(x))
+            off = engine.difference(end, engine.step(x, control))
+            np.testing.assert_allclose(off, 0, atol=1e-9, err_msg=name)
+            scale = np.abs(jacobian).max()
+            np.testing.assert_allclose(
+                jacobian / scale, engine.jacobian(x, control) / scale, atol=1e-6, err_msg=name
+            )

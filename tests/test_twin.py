@@ -1,0 +1,209 @@
+"""What becomes of a model that MJX does not know: mended, refused, or named among differences."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError, from_mjcf
+from mjx_drax.agreement import Probes, compare
+from mjx_drax.errors import DraxWarning
+from mjx_drax.twin import contact_pairs, differences, driven, has_constraints, twin
+
+CHAIN = """
+<mujoco model="chain">
+  <option timestep="0.01" {option}><flag {flag}/></option>
+  {before}
+  <worldbody>
+    <geom name="floor" type="{floor}" size="1 1 0.1" {floors}/>
+    <body name="upper" pos="0 0 1">
+      <joint name="one" axis="0 1 0" stiffness="3" damping="0.3" {joint}/>
+      <geom name="link" type="{link}" size="0.05 0.3 0.05" mass="1" pos="0 0 -0.3" {links}/>
+      <site name="tip" pos="0 0 -0.6"/>
+      <body name="lower" pos="0 0 -0.6">
+        <joint name="two" axis="0 1 0" armature="0.01"/>
+        <geom name="ball" size="0.08" mass="0.5" pos="0 0 -0.2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="strong" joint="one" gear="5" {motor}/>
+    <motor name="weak" joint="two" group="1"/>
+    {actuator}
+  </actuator>
+  {more}
+</mujoco>"""
+FREE = ["option", "before", "floors", "joint", "links", "motor", "actuator", "more"]
+NOTHING = dict.fromkeys(FREE, "") | {"flag": 'contact="enable"'}
+NOTHING |= {"floor": "plane", "link": "capsule"}
+
+
+def chain(**parts):
+    return mujoco.MjModel.from_xml_string(CHAIN.format(**(NOTHING | parts)))
+
+
+def rigid(**parts):
+    """Without contacts, whose steps compile faster."""
+    return chain(**({"flag": 'contact="disable"'} | parts))
+
+
+STATES = Probes(
+    np.array([[0.3, -0.2, 1.0, -0.5], [0.0, 0.0, 0.0, 0.0]]), np.array([[0.5, 1.0]] * 2)
+)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {
+            "option": 'solver="PGS" actuatorgroupdisable="1"',
+            "flag": 'contact="disable" energy="enable" fwdinv="enable" spring="disable"',
+        },
+        {"option": 'solver="CG"', "flag": 'contact="disable" damper="disable"'},
+        {"flag": 'contact="disable" spring="disable" damper="disable"'},
+    ],
+    ids=["PGS, energy, groups, springs", "CG, dampers", "springs and dampers"],
+)
+def test_what_is_mended_steps_like_the_c_engine(parts):
+    model = rigid(**parts)
+    assert differences(model) == []
+    np.testing.assert_allclose(compare(model, STATES).velocity, 0, atol=1e-10)
+
+
+def test_implicit_becomes_implicitfast_and_is_named():
+    model = rigid(option='integrator="implicit"')
+    assert twin(model).opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert any('"implicit" is planned with' in sentence for sentence in differences(model))
+
+
+def test_the_model_is_left_as_it_was():
+    model = rigid(option='solver="PGS" actuatorgroupdisable="1"', flag='spring="disable"')
+    before = (model.opt.solver, model.opt.disableflags, model.jnt_stiffness[0])
+    twin(model, contacts=False, bounded=np.ones(2, bool))
+    assert (model.opt.solver, model.opt.disableflags, model.jnt_stiffness[0]) == before
+    assert np.all(model.actuator_gainprm[:, 0] == 1)
+
+
+def test_limits_that_are_bounds_leave_the_dynamics():
+    model = rigid(joint='range="-1 1" limited="true"')
+    assert has_constraints(twin(model))
+    assert not has_constraints(twin(model, bounded=np.array([True, False])))
+
+
+def test_tendon_springs_have_stiffness_at_rest():
+    rope = '<tendon><spatial stiffness="2"><site site="tip"/><site site="wall"/></spatial></tendon>'
+    model = rigid(before='<worldbody><site name="wall" pos="1 0 0"/></worldbody>', more=rope)
+    rest = Probes(np.zeros((1, 4)), np.zeros((1, 2)))
+    found = compare(model, rest, derivatives=True)
+    assert found.velocity[0] < 1e-12
+    assert found.jacobian < 1e-7
+
+
+MUSCLE = 'dyntype="user" joint="one"'
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        (
+            {"floor": "box", "floors": 'pos="0 0 -1"', "link": "ellipsoid"},
+            r"cannot collide geoms 'floor' and 'link'.*contacts=False",
+        ),
+        ({"option": 'cone="elliptic"', "links": 'condim="1"', "floors": 'condim="1"'}, "pyramidal"),
+        (
+            {"actuator": '<adhesion body="upper" ctrlrange="0 1"/>'},
+            "does not support.*drive joints, tendons or sites",
+        ),
+        ({"actuator": f"<general {MUSCLE}/>"}, "does not support.*use motors"),
+        ({"flag": 'override="enable"'}, "does not support.*clear this flag"),
+        (
+            {
+                "more": '<deformable/><worldbody><body name="c" pos="0 0 3"><flexcomp name="f" '
+                'type="grid" count="2 2 1" spacing="0.1 0.1 0.1" dim="2"/></body></worldbody>'
+            },
+            "flex",
+        ),
+    ],
+    ids=["collision", "condim", "transmission", "dynamics", "flag", "flex"],
+)
+def test_what_is_refused_says_why_and_what_to_do(parts, words):
+    with pytest.raises(DraxError, match=words):
+        twin(chain(**parts))
+
+
+def test_contacts_that_mjx_cannot_make_can_be_left_out():
+    model = chain(floor="box", floors='pos="0 0 -1"', link="ellipsoid")
+    assert not has_constraints(twin(model, contacts=False))
+
+
+CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'
+TOUCH = "<sensor><{}/></sensor>"
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"option": 'integrator="implicit"'}, 'choose that, or "Euler"'),
+        ({"option": 'integrator="implicitfast"'}, 'prefer "Euler"'),
+        ({"flag": 'sleep="enable"'}, "fall asleep"),
+        ({"option": 'noslip_iterations="3"'}, "noslip_iterations"),
+        ({"joint": 'springref="0"', "stiff": True}, "polynomial stiffness"),
+        ({"damp": True}, "polynomial damping"),
+        ({"actuator": '<general joint="two" dyntype="filter" actearly="true"/>'}, "actearly"),
+        ({"motor": 'delay="0.02" nsample="4"'}, "delays"),
+        ({"motor": 'armature="0.1"'}, "own damping and armature"),
+        ({"more": CONNECT}, "connect and weld"),
+        ({"option": 'density="1"', "links": 'fluidshape="ellipsoid"'}, "ellipsoid fluid"),
+        ({"more": '<sensor><user name="odd" dim="1"/></sensor>'}, "sensor 'odd' is unknown"),
+        ({"floor": "cylinder"}, "contacts like that of 'floor' with 'ball'|'link'"),
+    ],
+)
+def test_differences_have_a_sentence_each(parts, words):
+    parts = dict(parts)
+    stiff, damp = parts.pop("stiff", False), parts.pop("damp", False)
+    model = chain(**parts)
+    if stiff:
+        model.jnt_stiffnesspoly[0] = 0.1
+    if damp:
+        model.dof_dampingpoly[0] = 0.1
+    found = differences(model)
+    assert len(found) == 1, found
+    assert words in found[0] or "contacts like that of 'floor'" in found[0]
+
+
+def test_contacts_that_are_left_out_do_not_differ():
+    assert differences(chain(floor="cylinder"), contacts=False) == []
+
+
+def test_a_plain_model_has_no_differences():
+    assert differences(chain()) == []
+
+
+def names(model):
+    return {frozenset(model.geom(g).name for g in pair) for pair in contact_pairs(model)}
+
+
+def test_contact_pairs_are_those_of_mujoco():
+    assert names(chain()) == {frozenset({"floor", "link"}), frozenset({"floor", "ball"})}
+    assert names(rigid()) == set()
+    assert names(chain(links='contype="0" conaffinity="0"')) == {frozenset({"floor", "ball"})}
+    excluded = '<contact><exclude body1="world" body2="lower"/></contact>'
+    assert names(chain(more=excluded)) == {frozenset({"floor", "link"})}
+    pair = '<contact><pair geom1="link" geom2="ball"/></contact>'
+    assert frozenset({"link", "ball"}) in names(chain(more=pair))
+    parents = chain(flag='filterparent="disable"')
+    assert frozenset({"link", "ball"}) in names(parents)
+
+
+def test_joints_that_are_driven():
+    assert driven(rigid()).tolist() == [True, True]
+    assert driven(rigid(motor='group="0"', joint='group="0"')).tolist() == [True, True]
+
+
+def test_models_that_step_too_differently_are_refused_or_warned_of():
+    def build(**parts):
+        return from_mjcf(rigid(**parts), horizon=0.1, running_residual=lambda data, u: u)
+
+    with pytest.raises(DraxError, match=r"differs from MuJoCo's C engine by .* armature .*joints"):
+        build(motor='armature="0.5"')
+    with pytest.warns(DraxWarning, match="own damping and armature"):
+        build(motor='armature="0.0001"')
