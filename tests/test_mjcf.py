@@ -257,8 +257,9 @@ def test_models_that_are_built(model, sizes, kinked):
     assert dynamics.kinked is kinked
 
 
-def test_a_joint_that_starts_beyond_its_range_keeps_its_limit_in_the_dynamics():
-    task = problem(arm(), x_init=[0.3, 0, 0, 0, 0])
+@pytest.mark.parametrize("start", [0.25, 0.3])
+def test_a_joint_that_starts_at_or_beyond_its_limit_keeps_it_in_the_dynamics(start):
+    task = problem(arm(), x_init=[start, 0, 0, 0, 0])
     assert not np.isfinite(task.bounds.x_upper).any()
     assert task.dynamics.kinked
 

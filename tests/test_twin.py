@@ -133,6 +133,8 @@ def test_what_is_refused_says_why_and_what_to_do(parts, words):
 def test_contacts_that_mjx_cannot_make_can_be_left_out():
     model = chain(floor="box", floors='pos="0 0 -1"', link="ellipsoid")
     assert not has_constraints(twin(model, contacts=False))
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    assert not has_constraints(twin(model))
 
 
 CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'
