@@ -25,7 +25,7 @@ from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
 from mjx_drax.errors import DraxError
 
 CLOSE = 0.03
-"""Smallest factor on the scatter of initial knots where f has kinks."""
+"""Smallest factor on the scatter of initial knots where f has kinks or states quaternions."""
 
 
 @register_dataclass
@@ -294,9 +294,10 @@ class Problem:
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.
 
-        They are drawn from the scatter box. Where f has kinks, bodies overlap far from x_init, and
-        forces lose all measure. There the box is shrunk towards x_init and the middle of the
-        controls, for each chain by another factor from `CLOSE` to 1, uniform in its logarithm.
+        They are drawn from the scatter box. Where f has kinks, bodies overlap far from x_init and
+        forces lose all measure; what floats freely may tumble at any speed. There the box is shrunk
+        towards x_init and the middle of the controls, for each chain by another factor from `CLOSE`
+        to 1, uniform in its logarithm.
         """
         if self.guess is not None:
             knots = self.guess(key)
@@ -307,7 +308,7 @@ class Problem:
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         x = box.x_lower + x * (box.x_upper - box.x_lower)
         u = box.u_lower + u * (box.u_upper - box.u_lower)
-        if dynamics.kinked:
+        if dynamics.kinked or dynamics.nx != dynamics.ndx:
             share = CLOSE ** jax.random.uniform(jax.random.fold_in(key, 2))
             middle = 0.5 * (box.u_lower + box.u_upper)
             x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)

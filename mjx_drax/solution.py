@@ -148,9 +148,19 @@ class Solution:
         return list(np.where(self.died_at >= 0, DIVERGED, names))
 
     @cached_property
+    def tracked(self) -> np.ndarray:
+        """Whether a chain is feasible, and a replay of it succeeds and ends as planned, (chains,).
+
+        In contact a goal can be reached by a motion that has little to do with the plan.
+        """
+        both = (self.open_loop, self.feedback)
+        return self.feasible & np.any([r.success & (r.final_deviation < TRACKED) for r in both], 0)
+
+    @cached_property
     def best_chain(self) -> int:
-        """The cheapest chain that succeeds; else that is feasible; else the least infeasible."""
-        for eligible in (self.feasible & (self.success | self.open_loop.success), self.feasible):
+        """The cheapest that is tracked, succeeds or is feasible; else the least infeasible."""
+        succeeds = self.feasible & (self.success | self.open_loop.success)
+        for eligible in (self.tracked, succeeds, self.feasible):
             if eligible.any():
                 return int(np.argmin(np.where(eligible, self.cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
