@@ -259,6 +259,7 @@ def test_ablations_take_out_one_part():
     assert type(found["identity"].preconditioner).__name__ == "Identity"
 
 
+@pytest.mark.slow
 def test_one_thread_is_one_core():
     rows = benchmark.one_thread(0, [1])
     assert all(row["cpus"] == 1 for row in rows)

@@ -11,8 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import from_mjcf
+from mjx_drax import Autodiff, Smoothed, from_mjcf
 from mjx_drax.agreement import Engine
+from mjx_drax.linearize import linearize
+from mjx_drax.problem import Trajectory
 
 FLOATING = """
 <mujoco model="floating">
@@ -109,7 +111,13 @@ STATES = {
 }
 
 
-@pytest.mark.parametrize("xml", STATES, ids=["floating", "linked"])
+@pytest.mark.parametrize(
+    "xml",
+    [
+        pytest.param(xml, id=name, marks=[pytest.mark.slow] if name == "linked" else [])
+        for xml, name in zip(STATES, ("floating", "linked"), strict=True)
+    ],
+)
 def test_a_step_and_its_jacobian_are_the_c_engines(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     engine = Engine(model)
@@ -136,3 +144,26 @@ def test_a_step_and_its_jacobian_are_the_c_engines(xml):
             np.testing.assert_allclose(
                 jacobian / scale, engine.jacobian(x, control) / scale, atol=1e-6, err_msg=name
             )
+
+
+def test_smoothed_derivatives_feel_a_contact_from_afar():
+    """A ball falls towards a floor 2 mm below it; `derivatives` is the problem's own choice."""
+    xml = """<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 0.1"/>
+      <body pos="0 0 0.102"><joint name="up" type="slide" axis="0 0 1"/>
+      <geom size="0.1" mass="1"/></body></worldbody>
+      <actuator><motor joint="up"/></actuator></mujoco>"""
+    felt = []
+    for derivatives in (None, Smoothed(pairs=32, radius=0.01)):
+        problem = from_mjcf(
+            xml,
+            horizon=0.002,
+            dt=0.002,
+            running_residual=lambda data, u: u,
+            derivatives=derivatives,
+        )
+        knots = Trajectory(problem.x_init[None], jnp.zeros((1, 1)))
+        keys = jax.random.split(jax.random.key(0), 1)
+        model = jax.jit(lambda p, z, k: linearize(p, z, Autodiff(), k))(problem, knots, keys)
+        felt.append(float(model.A[0, 1, 0]))  # of the velocity by the height
+    assert felt[0] == 0.0
+    assert felt[1] < -0.1

@@ -57,6 +57,7 @@ def test_convergence_has_a_curve_for_every_penalty():
     assert figure_is_drawn(figure)
 
 
+@pytest.mark.slow
 def test_bug_trap_gives_every_method_the_same_budget():
     numbers, figure = reproduce.bug_trap(chains=4, iterations=30, longer=2)
     budgets = {row["method"]: row["iterations"] for row in numbers["rows"]}
@@ -95,6 +96,7 @@ def test_batched_problems_start_where_they_should():
     assert reproduce._reaches(problem, trajectory, starts)[0]
 
 
+@pytest.mark.slow
 def test_open_questions_answers_each_of_them():
     numbers, figure = reproduce.open_questions(chains=4, iterations=20, limit=80, pairs=(6,))
     assert numbers["preconditioning"][0]["method"] == "identity"

@@ -132,6 +132,7 @@ def test_every_class_of_operations(function, x64, strictly):
             close(jax.jit(scalarized(f))(x), jax.jit(f)(x), 1e-12 if x64 else 3e-5)
 
 
+@pytest.mark.slow
 def test_inside_of_every_transformation(strictly):
     with jax.enable_x64(True):
         x = jnp.asarray(RNG.uniform(0.5, 2.0, (5, 3, 4)))
@@ -269,7 +270,7 @@ MODELS = {
 }
 
 
-SLOW = {"pendulum", "chain"}  # to compile
+SLOW = {"pendulum", "chain", "acrobot"}  # to compile
 
 
 @pytest.mark.parametrize(
