@@ -153,6 +153,7 @@ def test_the_identitys_drift_is_the_steepest_descent(task, chain):
         assert slope == pytest.approx(-product / size, abs=1e-2 * length)
 
 
+@pytest.mark.slow
 def test_the_tail_needs_few_steps_and_keeps_quaternions_unit(task):
     solver = Langevin(iterations=0, tail=15)
     start = jax.vmap(task.draw)(jax.random.split(jax.random.key(0), 4))

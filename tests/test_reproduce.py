@@ -69,6 +69,7 @@ def test_bug_trap_gives_every_method_the_same_budget():
     assert figure_is_drawn(figure)
 
 
+@pytest.mark.slow
 def test_parallel_table_solves_a_problem_for_each_initial_state():
     numbers, figure = reproduce.parallel_table(chains=4, iterations=50, sizes=(4, 8))
     assert [(row["N"], row["x_init"]) for row in numbers["rows"]] == [

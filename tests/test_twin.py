@@ -89,6 +89,7 @@ def test_limits_that_are_bounds_leave_the_dynamics():
     assert not has_constraints(twin(model, bounded=np.array([True, False])))
 
 
+@pytest.mark.slow
 def test_tendon_springs_have_stiffness_at_rest():
     rope = '<tendon><spatial stiffness="2"><site site="tip"/><site site="wall"/></spatial></tendon>'
     model = rigid(before='<worldbody><site name="wall" pos="1 0 0"/></worldbody>', more=rope)
