@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax import physics
+from mjx_drax import host, physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError, DraxWarning
 from mjx_drax.joints import Joints
-from mjx_drax.twin import differences, free_ranges, twin
+from mjx_drax.twin import control_ranges, differences, free_ranges, twin
 
 WRONG, NOTICEABLE = 1e-2, 1e-6
 """One-step errors of velocities [rad/s, m/s] above which a model is refused, or warned of."""
@@ -66,30 +66,18 @@ class Engine:
     def step(self, x: np.ndarray, u: np.ndarray, steps: int = 1) -> np.ndarray:
         """The state (nx,) some steps after x (nx,) under u (nu,)."""
         model, data = self.model, mujoco.MjData(self.model)
-        data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
+        host.set_state(model, data, x)
         data.ctrl[:] = u
         mujoco.mj_step(model, data, steps)
         return np.concatenate([data.qpos, data.qvel, data.act])
-
-    def integrate(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
-        """x + dx for a tangent vector dx (2 nv + na,)."""
-        nq, nv = self.model.nq, self.model.nv
-        qpos = x[:nq].copy()
-        mujoco.mj_integratePos(self.model, qpos, dx[:nv], 1.0)
-        return np.concatenate([qpos, x[nq:] + dx[nv:]])
-
-    def difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """x - y in the tangent space at y, (2 nv + na,)."""
-        nq, off = self.model.nq, np.empty(self.model.nv)
-        mujoco.mj_differentiatePos(self.model, off, 1.0, y[:nq], x[:nq])
-        return np.concatenate([off, x[nq:] - y[nq:]])
 
     def jacobian(self, x: np.ndarray, u: np.ndarray, eps: float = 1e-6) -> np.ndarray:
         """[df/dx df/du] (ndx, ndx + nu) by central differences in tangent space."""
         reached, ndx = self.step(x, u), 2 * self.model.nv + self.model.na
 
         def moved(dz: np.ndarray) -> np.ndarray:
-            return self.difference(self.step(self.integrate(x, dz[:ndx]), u + dz[ndx:]), reached)
+            end = self.step(host.integrate(self.model, x, dz[:ndx]), u + dz[ndx:])
+            return host.difference(self.model, end, reached)
 
         nudges = eps * np.eye(ndx + self.model.nu)
         return np.stack([moved(e) - moved(-e) for e in nudges], axis=1) / (2 * eps)
@@ -105,11 +93,10 @@ def probes(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int = 
         seed: of the random numbers.
     """
     model, rng = engine.model, np.random.default_rng(seed)
-    ranges = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0])
     nv, scale = model.nv, np.zeros(2 * model.nv + model.na)
     scale[:nv], scale[nv : 2 * nv] = NUDGE, SPEED
-    u = rng.uniform(ranges[:, 0], ranges[:, 1], (2 + len(MOMENTS), model.nu))
-    x = [x_init, engine.integrate(x_init, scale * rng.normal(size=scale.shape))]
+    u = rng.uniform(*control_ranges(model), (2 + len(MOMENTS), model.nu))
+    x = [x_init, host.integrate(model, x_init, scale * rng.normal(size=scale.shape))]
     for moment, control in zip(MOMENTS, u[2:], strict=True):
         x.append(engine.step(x_init, control, max(1, round(moment / model.opt.timestep))))
     states, where = np.stack(x), model.jnt_qposadr[bounded]

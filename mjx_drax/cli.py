@@ -33,6 +33,8 @@ on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
   x_bounds, u_bounds       (lower, upper)
   x_scatter, u_scatter     (lower, upper): where initial knots are drawn
   guess(key) -> Trajectory initial knots of one chain
+  contacts                 False: the plan knows no contacts; constraints keep things apart
+  derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin
 """
 _PROBLEM_NAMES = (
@@ -53,6 +55,8 @@ _PROBLEM_NAMES = (
     "x_scatter",
     "u_scatter",
     "guess",
+    "contacts",
+    "derivatives",
 )
 
 if TYPE_CHECKING:

@@ -27,8 +27,10 @@ from numpy.typing import ArrayLike
 
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError
+from mjx_drax.host import between, interpolated, moved, set_state
 from mjx_drax.mjcf import index
 from mjx_drax.problem import Box, Problem, Trajectory
+from mjx_drax.twin import moment_arms
 
 Pose = str | ArrayLike
 """Name of a keyframe, or qpos (nq,)."""
@@ -157,9 +159,9 @@ def spread(
     speed = np.diff(turn, axis=1, prepend=0) / float(problem.dynamics.dt)
     act = half_x[..., model.nq + model.nv :] * _waves(rng, chains, K, model.na)[:, 1:]
     q, rest = np.split(np.broadcast_to(x, (chains, K, nx)), [model.nq], axis=-1)
-    moved = [_moved(model, *pair) for pair in zip(_rows(q), _rows(turn), strict=True)]
+    turned = [moved(model, *pair) for pair in zip(_rows(q), _rows(turn), strict=True)]
     rest = rest + np.concatenate([speed, act], axis=-1)
-    states = np.concatenate([np.reshape(moved, q.shape), rest], axis=-1)
+    states = np.concatenate([np.reshape(turned, q.shape), rest], axis=-1)
     return _bounded(problem, states, u + du)
 
 
@@ -214,38 +216,11 @@ def _qpos(model: mujoco.MjModel, pose: Any) -> np.ndarray:
     return qpos
 
 
-def _moved(model: mujoco.MjModel, qpos: np.ndarray, dq: np.ndarray, by: float = 1.0) -> np.ndarray:
-    """Position (nq,) reached from qpos along the tangent vector dq (nv,), a fraction of it."""
-    out = np.array(qpos, float)
-    mujoco.mj_integratePos(model, out, dq, by)
-    return out
-
-
-def _between(model: mujoco.MjModel, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The tangent vector (nv,) that leads from one position to the other."""
-    out = np.zeros(model.nv)
-    mujoco.mj_differentiatePos(model, out, 1.0, one, other)
-    return out
-
-
-def interpolated(
-    model: mujoco.MjModel, times: np.ndarray, qpos: np.ndarray, at: np.ndarray
-) -> np.ndarray:
-    """Positions (n, nq) at the times `at` (n,), from positions (T, nq) at rising times (T,)."""
-    out = []
-    for time in np.clip(at, times[0], times[-1]):
-        i = min(int(np.searchsorted(times, time, side="right")), len(times) - 1)
-        start, stop = times[i - 1], times[i]
-        share = (time - start) / (stop - start) if stop > start else 0.0
-        out.append(_moved(model, qpos[i - 1], _between(model, qpos[i - 1], qpos[i]), share))
-    return np.array(out)
-
-
 def _through(problem: Problem, times: np.ndarray, qpos: np.ndarray) -> Trajectory:
     """The trajectory along positions (T, nq) at rising times (T,)."""
     model, dt = _model(problem), float(problem.dynamics.dt)
-    q = interpolated(model, times, qpos, problem.times)
-    v = np.array([_between(model, *pair) for pair in itertools.pairwise(q)]) / dt
+    q = np.array([interpolated(model, qpos, times, time) for time in problem.times])
+    v = np.array([between(model, *pair) for pair in itertools.pairwise(q)]) / dt
     start = np.asarray(problem.x_init, float)
     act = np.broadcast_to(start[model.nq + model.nv :], (problem.horizon, model.na))
     states = np.concatenate([start[None], np.concatenate([q[1:], v, act], axis=1)])
@@ -264,13 +239,13 @@ def controls(model: mujoco.MjModel, x: np.ndarray, dt: float, rest: np.ndarray) 
     out = np.broadcast_to(rest, (len(x) - 1, model.nu)).copy()
     nq, nv = model.nq, model.nv
     for k, u in enumerate(out):
-        data.qpos[:], data.qvel[:], data.act[:] = np.split(x[k], [nq, nq + nv])
+        set_state(model, data, x[k])
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         at_rest, above = (_forces(model, data, u + more) for more in (0.0, 1.0))
         data.qacc[:] = (x[k + 1, nq : nq + nv] - x[k, nq : nq + nv]) / dt
         mujoco.mj_inverse(model, data)
-        moment = _moment(model, data)
+        moment = moment_arms(model, data)
         slope, lacking = moment.T * (above - at_rest), data.qfrc_inverse - moment.T @ at_rest
         if np.isfinite(slope).all() and np.isfinite(lacking).all():
             out[k] = u + np.linalg.lstsq(slope, lacking, rcond=None)[0]
@@ -282,13 +257,6 @@ def _forces(model: mujoco.MjModel, data: mujoco.MjData, u: np.ndarray) -> np.nda
     data.ctrl[:] = u
     mujoco.mj_fwdActuation(model, data)
     return data.actuator_force.copy()
-
-
-def _moment(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Moment arms (nu, nv): generalized forces are their transpose times the actuators' forces."""
-    moment, at = np.zeros((model.nu, model.nv)), (data.moment_rownnz, data.moment_rowadr)
-    mujoco.mju_sparse2dense(moment, data.actuator_moment, *at, data.moment_colind)
-    return moment
 
 
 def middle(bounds: Box) -> np.ndarray:

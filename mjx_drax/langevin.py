@@ -32,6 +32,7 @@ from jax.typing import ArrayLike
 from mjx_drax.bounds import LogBarrier, Sides
 from mjx_drax.dynamics import Static
 from mjx_drax.errors import DraxError
+from mjx_drax.linalg import exact
 from mjx_drax.precondition import (
     Bounds,
     Diagonal,
@@ -214,8 +215,7 @@ class Langevin:
         self._check_adjusted(problem)
         chains, dynamics = trajectory.x.shape[0], problem.dynamics
         K, nu, ndx = problem.horizon, dynamics.nu, dynamics.ndx
-        with_slack = jax.vmap(_with_slack, in_axes=(None, 0))(problem, trajectory)
-        inside = jax.vmap(self.bounds.interior, in_axes=(None, 0))(problem.bounds, with_slack)
+        inside = self._inside(problem, trajectory)
         m, m_end = (
             c.equalities + c.inequalities for c in (problem.constraint, problem.terminal_constraint)
         )
@@ -235,14 +235,16 @@ class Langevin:
         )
 
     def moved_to(self, problem: Problem, state: State, trajectory: Trajectory) -> State:
-        """The chains with other knots (chains, K, ...), and damped as at first."""
+        """The chains with other knots (chains, K, ...), and slacks that go with them."""
+        return replace(state, trajectory=self._inside(problem, trajectory))
+
+    def _inside(self, problem: Problem, trajectory: Trajectory) -> Trajectory:
+        """Knots (chains, K, ...) with their slack variables, inside the bounds."""
 
         def inside(knots: Trajectory) -> Trajectory:
             return self.bounds.interior(problem.bounds, _with_slack(problem, knots))
 
-        return replace(
-            state, trajectory=jax.vmap(inside)(trajectory), damping=jnp.ones_like(state.damping)
-        )
+        return jax.vmap(inside)(trajectory)
 
     def step(
         self, problem: Problem, state: State, iteration: ArrayLike, tail: bool = True
@@ -443,6 +445,7 @@ def _keep_finite(old: State, new: State, iteration: Array) -> State:
 
 
 @jax.jit
+@exact
 def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     """Cost, max|h| and bound violation of a batch of trajectories."""
 
@@ -453,6 +456,7 @@ def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
 
 
 @partial(jax.jit, static_argnames="tail")
+@exact
 def advance(
     solver: Langevin,
     problem: Problem,
@@ -470,6 +474,7 @@ def advance(
 
 
 @jax.jit
+@exact
 def feedback_gains(solver: Langevin, problem: Problem, state: State) -> Array:
     """Time-varying LQR gains (chains, K, nu, ndx) for a solver whose metric brings none."""
 

@@ -259,7 +259,7 @@ def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> 
     plan = np.zeros((count, problem.horizon + 1, dynamics.nx))
     plan[:, 0] = np.asarray(problem.x_init, float) if x_init is None else x_init
     gains = np.zeros((*u.shape, dynamics.ndx))
-    states, applied = dynamics.replay(plan, np.asarray(u, float), gains, _limits(problem))
+    states, applied = problem.replay(plan, u, gains)
     below = np.asarray(bounds.x_lower) - states[:, 1:]
     above = states[:, 1:] - np.asarray(bounds.x_upper)
     inside = np.maximum(below, above).max(axis=(1, 2)) < OUTSIDE
@@ -271,19 +271,15 @@ def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> 
     return Verdicts(
         np.array(success),
         np.asarray(evaluate(problem, knots).cost),
-        _seconds(problem, plan[:1], np.asarray(u[:1], float), gains[:1]),
+        _seconds(problem, plan[:1], u[:1], gains[:1]),
     )
 
 
 def _seconds(problem: Problem, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> float:
     for _ in range(2):  # the first compiles
         clock = time.perf_counter()
-        problem.dynamics.replay(plan, u, gains, _limits(problem))
+        problem.replay(plan, u, gains)
     return time.perf_counter() - clock
-
-
-def _limits(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(problem.bounds.u_lower, float), np.asarray(problem.bounds.u_upper, float)
 
 
 def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | None = None) -> Row:

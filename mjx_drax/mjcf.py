@@ -24,6 +24,7 @@ from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, Differentiator, InScalars
 from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
+from mjx_drax.host import difference, set_state
 from mjx_drax.joints import Joints
 from mjx_drax.physics import mjx
 from mjx_drax.problem import (
@@ -214,12 +215,10 @@ class MjxDynamics(Dynamics):
         def chain(c: int) -> tuple[np.ndarray, np.ndarray]:
             model, data = self.mj_model, mujoco.MjData(self.mj_model)
             states, applied = np.empty(plan.shape[1:]), np.empty(u.shape[1:])
-            off = np.empty(self.ndx)
             states[0] = plan[c, 0]
-            _set_state(model, data, states[0])
+            set_state(model, data, states[0])
             for k in range(len(applied)):
-                _difference(model, states[k], plan[c, k], off)
-                wanted = u[c, k] + gains[c, k] @ off
+                wanted = u[c, k] + gains[c, k] @ difference(model, states[k], plan[c, k])
                 applied[k] = data.ctrl[:] = np.clip(wanted, lower[k], upper[k])
                 mujoco.mj_step(model, data, self.substeps)
                 if any(data.warning[w].number for w in _BLOWN_UP):  # the engine reset itself
@@ -238,13 +237,13 @@ class MjxDynamics(Dynamics):
             return super().deviation(states, plan)
         off = np.empty((*states.shape[:-1], self.ndx))
         for i in np.ndindex(states.shape[:-1]):
-            _difference(self.mj_model, states[i], plan[i], off[i])
+            off[i] = difference(self.mj_model, states[i], plan[i])
         return np.abs(off).max(axis=-1)
 
     def observe_replayed(self, x: np.ndarray) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
         data = mujoco.MjData(self.mj_model)
-        _set_state(self.mj_model, data, x)
+        set_state(self.mj_model, data, x)
         mujoco.mj_forward(self.mj_model, data)
         return data
 
@@ -286,21 +285,6 @@ def _no_log_file() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(handler)
-
-
-def _set_state(model: mujoco.MjModel, data: mujoco.MjData, x: np.ndarray) -> None:
-    """Write x = [qpos, qvel, act] into the C engine's data."""
-    data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
-
-
-def _difference(model: mujoco.MjModel, x: np.ndarray, plan: np.ndarray, out: np.ndarray) -> None:
-    """Write x - plan into `out` (ndx,), by the C engine's own arithmetic."""
-    nq, nv = model.nq, model.nv
-    if nq == nv:
-        np.subtract(x, plan, out)
-        return
-    mujoco.mj_differentiatePos(model, out[:nv], 1.0, plan[:nq], x[:nq])
-    np.subtract(x[nq:], plan[nq:], out[nv:])
 
 
 def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:

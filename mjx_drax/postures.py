@@ -13,6 +13,7 @@ import numpy as np
 
 from mjx_drax.agreement import Engine
 from mjx_drax.errors import DraxError
+from mjx_drax.host import between
 from mjx_drax.mjcf import (
     bounded_joints,
     from_mjcf,
@@ -24,7 +25,7 @@ from mjx_drax.mjcf import (
 )
 from mjx_drax.problem import Problem
 from mjx_drax.terms import Terms
-from mjx_drax.twin import free_ranges
+from mjx_drax.twin import control_ranges, free_ranges
 
 NEAR = 0.02
 """Largest |qpos - posture|, in tangent space [rad, m], that reaches it."""
@@ -56,7 +57,7 @@ def reach(
     require_movable(model, name)
     steps = steps_between_knots(model, None)
     dt = steps * model.opt.timestep
-    limits = _control_limits(model)
+    limits = control_ranges(model)
     x_init = initial_state(model, name, None)
     path = _motion(model, name, x_init, limits, steps, max(SHORTEST, round(horizon / dt)), seed)
     target = path[-1, : model.nq]
@@ -64,9 +65,7 @@ def reach(
     half = np.maximum(0.5 * (limits[1] - limits[0]), 1e-6)
 
     def goal(data: mujoco.MjData) -> bool:
-        off = np.empty(model.nv)
-        mujoco.mj_differentiatePos(model, off, 1.0, target, data.qpos)
-        return bool(np.abs(off).max() < NEAR)
+        return bool(np.abs(between(model, target, data.qpos)).max() < NEAR)
 
     return from_mjcf(
         model,
@@ -77,13 +76,6 @@ def reach(
         goal=goal,
         name=name,
     )
-
-
-def _control_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of controls, (nu,) each: the model's, or +-1 where it has none."""
-    limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    lower, upper = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
-    return lower, upper
 
 
 def _motion(

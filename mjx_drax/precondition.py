@@ -73,7 +73,8 @@ class Direction:
 class Memoryless:
     """A metric that is made anew in every iteration, and whose multipliers step with its knots.
 
-    `ladder` holds the step sizes that the tail chooses from: all halvings down to 1/256.
+    `ladder` holds the step sizes that the tail chooses from, all halvings down to 1/256; the last
+    one is 0, which stands still.
     """
 
     multipliers_step_alone = False

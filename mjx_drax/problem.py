@@ -314,6 +314,20 @@ class Problem:
             x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
         return Trajectory(dynamics.valid(x), u)
 
+    def replay(
+        self, plan: ArrayLike, u: ArrayLike, gains: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`Dynamics.replay` within the control bounds, from numbers of any precision.
+
+        Args:
+            plan: planned states x_0..x_K, (chains, K + 1, nx).
+            u: planned controls, (chains, K, nu).
+            gains: feedback K_k, (chains, K, nu, ndx); zeros replay open loop.
+        """
+        limits = np.asarray(self.bounds.u_lower, float), np.asarray(self.bounds.u_upper, float)
+        plan, u, gains = (np.asarray(given, float) for given in (plan, u, gains))
+        return self.dynamics.replay(plan, u, gains, limits)
+
     def reached(self, x: np.ndarray) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.
 

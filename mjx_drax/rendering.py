@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from mjx_drax._mujoco import APT_EGL, mujoco
 from mjx_drax.errors import DraxError
+from mjx_drax.host import interpolated
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -224,7 +225,7 @@ def _frames(
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         with _drawer(model, height, width) as drawer:
             for time in at:
-                _pose(model, data, _interpolate(model, positions, instants, time))
+                _pose(model, data, interpolated(model, positions, instants, time))
                 mujoco.mjv_updateScene(model, data, option, None, view, everything, scene)
                 yield _write(drawer.render(scene), overlay, time)
 
@@ -311,19 +312,6 @@ def _video_path(path: str | os.PathLike[str]) -> Path:
     except OSError as error:
         raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
     return target
-
-
-def _interpolate(model: mujoco.MjModel, qpos: Floats, times: Floats, time: float) -> Floats:
-    """Position (nq,) at a time [s], moving at constant velocity between knots."""
-    last = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
-    if last == len(times) - 1:
-        return qpos[last]
-    span = times[last + 1] - times[last]
-    velocity = np.zeros(model.nv)  # tangent vector: right for quaternions as well
-    mujoco.mj_differentiatePos(model, velocity, span, qpos[last], qpos[last + 1])
-    position = qpos[last].copy()
-    mujoco.mj_integratePos(model, position, velocity, time - times[last])
-    return position
 
 
 def _pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:

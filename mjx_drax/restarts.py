@@ -44,7 +44,6 @@ from mjx_drax.langevin import (
     advance,
     evaluate,
 )
-from mjx_drax.linalg import exact
 from mjx_drax.problem import Problem, Trajectory
 from mjx_drax.schedules import Geometric
 
@@ -173,7 +172,6 @@ class Run(Attempt):
     solve_time: float
 
 
-@exact
 def run(
     problem: Problem,
     chains: int,
@@ -308,13 +306,8 @@ class _Search:
     def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float) -> Attempt:
         """Every chain's knots replaced by a replay of its controls."""
         problem, knots = self.problem, kept.state.trajectory
-        bounds, dtype = problem.bounds, knots.x.dtype
-        states, controls = problem.dynamics.replay(
-            np.asarray(problem.with_start(knots), float),
-            np.asarray(knots.u, float),
-            with_feedback * np.asarray(kept.state.gains, float),
-            (np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)),
-        )
+        gains, dtype = with_feedback * np.asarray(kept.state.gains), knots.x.dtype
+        states, controls = problem.replay(problem.with_start(knots), knots.u, gains)
         replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
         state = _moved_to(flow, problem, kept.state, replayed)
         state, info = _advance(flow, problem, state, 0, 0, True)  # compiled already; just evaluates

@@ -23,7 +23,6 @@ import numpy as np
 
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Langevin, evaluate, feedback_gains
-from mjx_drax.linalg import exact
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
 from mjx_drax.restarts import Progress, Restarts, Run, run
@@ -250,7 +249,6 @@ def solve(
     return _certified(problem, solver, seed, run(problem, chains, seed, solver, guess, progress))
 
 
-@exact
 def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Run) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
     state, records = run.state, run.records
@@ -287,16 +285,10 @@ def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Ru
 
 def _replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> Replays:
     """Replay every chain's controls with the given gains, and judge where they end."""
-    dynamics, bounds = problem.dynamics, problem.bounds
     chains = len(gains)
     plan = np.asarray(problem.with_start(trajectories), float)
-    states, controls = dynamics.replay(
-        plan,
-        np.asarray(trajectories.u, float),
-        gains.astype(float),
-        (np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)),
-    )
-    off = np.nan_to_num(dynamics.deviation(states, plan), nan=np.inf)
+    states, controls = problem.replay(plan, trajectories.u, gains)
+    off = np.nan_to_num(problem.dynamics.deviation(states, plan), nan=np.inf)
     dtype = problem.x_init.dtype
     replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
     info = evaluate(problem, replayed)

@@ -21,6 +21,7 @@ from mjx_drax.errors import DraxError
 from mjx_drax.physics import mjx
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
+_SENSORS = {int(kind) for kind in mjx.SensorType}
 
 
 def twin(
@@ -89,8 +90,7 @@ def _mend(model: mujoco.MjModel) -> None:
     silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
     model.actuator_gainprm[silent] = 0.0
     model.actuator_biasprm[silent] = 0.0
-    sensors = {int(s) for s in mjx.SensorType}
-    unknown = np.array([int(s) not in sensors for s in model.sensor_type], bool)
+    unknown = np.array([int(s) not in _SENSORS for s in model.sensor_type], bool)
     model.sensor_type[unknown] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # `differences` names them
 
 
@@ -202,10 +202,9 @@ def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
         "connect and weld constraints pull a little differently: prefer joints",
     )
     note(model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box")
-    sensors = {int(s) for s in mjx.SensorType}
     for i, kind in enumerate(model.sensor_type):
         note(
-            int(kind) not in sensors,
+            int(kind) not in _SENSORS,
             f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs",
         )
     if contacts:
@@ -220,18 +219,23 @@ def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
     return found
 
 
+def moment_arms(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Moment arms (nu, nv): generalized forces are their transpose times the actuators' forces."""
+    moment, at = np.zeros((model.nu, model.nv)), (data.moment_rownnz, data.moment_rowadr)
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, *at, data.moment_colind)
+    return moment
+
+
 def moments(model: mujoco.MjModel) -> np.ndarray:
     """Of a unit of every actuator's force, the largest force on every velocity, (nu, nv).
 
     Over the default pose and two random ones, because what pulls at what depends on the pose.
     """
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    largest, moment = np.zeros((model.nu, model.nv)), np.zeros((model.nu, model.nv))
+    largest = np.zeros((model.nu, model.nv))
     for _ in range(3):
         mujoco.mj_forward(model, data)
-        at = data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        mujoco.mju_sparse2dense(moment, data.actuator_moment, *at)
-        largest = np.maximum(largest, np.abs(moment))
+        largest = np.maximum(largest, np.abs(moment_arms(model, data)))
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
     return largest
 
@@ -246,6 +250,13 @@ def driven(model: mujoco.MjModel) -> np.ndarray:
 def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
     return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
+
+
+def control_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of controls, (nu,) each: the model's, or +-1 where it has none."""
+    limited = model.actuator_ctrllimited.astype(bool)[:, None]
+    lower, upper = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    return lower, upper
 
 
 def constraint_rows(model: mjx.Model) -> int:

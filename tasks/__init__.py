@@ -17,7 +17,7 @@ from mjx_drax.errors import DraxError
 
 def names() -> list[str]:
     """Names of all tasks."""
-    return sorted(p.stem for p in Path(__file__).parent.glob("[!_]*.py"))
+    return sorted(p.stem for p in Path(__file__).parent.glob("*.py") if p.stem != "__init__")
 
 
 def summary(name: str) -> str:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax import Problem, from_mjcf
+from mjx_drax.distances import CAPSULE, DISTANCES, SPHERE, Shape
 from mjx_drax.mjcf import load
 from mjx_drax.models import path
-from mjx_drax.tasks._distance import capsules
 
 DT = 0.04  # [s]
 DOWN = np.array([0.0, 0.0, -1.0])  # where the hand points at the end
@@ -30,7 +31,7 @@ def make(horizon: float = 2.0) -> Problem:
         dt=DT,
         running_residual=effort,
         terminal_residual=Partial(reach, tool, target),
-        inequality=Partial(clearance, *spheres(model), capsules(model)),
+        inequality=Partial(clearance, *spheres(model), *pillar(model)),
         contacts=False,  # the constraint keeps the plan clear; the C engine lets things touch
         x_scatter=(x_lower, x_upper),
         goal=lambda data: (
@@ -60,14 +61,23 @@ def reach(tool: int, target: np.ndarray, data: Any) -> Array:
     return jnp.concatenate([50.0 * off, 10.0 * pointing, 5.0 * data.qvel])
 
 
-def spheres(model: Any) -> tuple[np.ndarray, np.ndarray]:
+def spheres(model: Any) -> tuple[np.ndarray, Array]:
     """Geoms whose middles are kept clear, and how far from the pillar's surface each must be."""
-    names = ["upper_roll", "fore", "fore_roll", "wrist", "hand"]
-    return np.array([model.geom(name).id for name in names]), np.array([0.09, 0.1, 0.08, 0.08, 0.1])
+    radii = {"upper_roll": 0.09, "fore": 0.1, "fore_roll": 0.08, "wrist": 0.08, "hand": 0.1}
+    sizes = jnp.array([[radius, 0.0, 0.0] for radius in radii.values()])
+    return np.array([model.geom(name).id for name in radii]), sizes
+
+
+def pillar(model: Any) -> tuple[int, Array]:
+    """The obstacle, a capsule, and its size."""
+    geom = model.geom("pillar")
+    return geom.id, jnp.asarray(geom.size)
 
 
 def clearance(
-    geoms: np.ndarray, around: np.ndarray, obstacles: Partial, data: Any, u: Array
+    middles: np.ndarray, sizes: Array, capsule: int, size: Array, data: Any, u: Array
 ) -> Array:
     """How far each sphere is from having its margin to the pillar [m]; <= 0 is clear."""
-    return around + MARGIN - obstacles(data.geom_xpos[geoms])[:, 0]
+    obstacle = Shape(data.geom_xpos[capsule], data.geom_xmat[capsule], size)
+    spheres = Shape(data.geom_xpos[middles], data.geom_xmat[middles], sizes)
+    return MARGIN - jax.vmap(DISTANCES[SPHERE, CAPSULE], (0, None))(spheres, obstacle)

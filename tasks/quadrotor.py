@@ -7,17 +7,17 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import Partial
 
-from mjx_drax import Problem, from_mjcf
+from mjx_drax import Problem, Terms, from_mjcf
 from mjx_drax.mjcf import load
 from mjx_drax.models import path
-from mjx_drax.tasks._distance import capsules
 
 DT = 0.04  # [s]
 GOAL = np.array([2.5, 0.0, 1.0])  # [m]
 HOVER = 9.81 / 4  # thrust of each rotor that carries a quarter of the weight [N]
-CLEAR = 0.26 + 0.02  # radius of the hull, a sphere about all that flies, and a margin [m]
+MARGIN = 0.02  # between the hull, a sphere about all that flies, and each bar [m]
+SIDES = ("left", "right", "below", "above")
+BARS = ["pillar", *(f"{gate}_{side}" for gate in ("first", "second") for side in SIDES)]
 GATES = np.array([[-1.2, 0.6, 1.4], [1.2, -0.6, 0.9]])  # their middles [m]
 
 
@@ -30,7 +30,7 @@ def make(horizon: float = 4.0) -> Problem:
         dt=DT,
         running_residual=effort,
         terminal_residual=arrival,
-        inequality=Partial(clearance, capsules(model)),
+        inequality=Terms(model).clearance("hull", BARS, margin=MARGIN),
         contacts=False,  # the constraint keeps the plan clear; the C engine lets things touch
         goal=lambda data: (
             np.linalg.norm(data.qpos[:3] - GOAL) < 0.1
@@ -54,8 +54,3 @@ def arrival(data: Any) -> Array:
     """Distance to the goal, tilt and speeds, weighted; half its squared norm is the cost."""
     tilt = data.xmat[1][:2, 2]
     return jnp.concatenate([20.0 * (data.qpos[:3] - GOAL), 15.0 * tilt, 6.0 * data.qvel])
-
-
-def clearance(bars: Partial, data: Any, u: Array) -> Array:
-    """How far the hull is from having its margin to each bar [m]; <= 0 is clear."""
-    return CLEAR - bars(data.qpos[:3])

@@ -275,3 +275,12 @@ def test_numbers_change_without_recompiling():
     assert set(traced[traced.index("case") :]) == {"case"}  # traced for the first case only
     for answer in answers[1:]:
         assert not np.array_equal(answer, answers[0])  # every one of these numbers matters
+
+
+def test_products_are_not_rounded_on_gpus():
+    """By default JAX rounds their factors to 10 bits (TF32) there, and defects stall at 1e-3."""
+    solver = replace(QUIET, iterations=1, tail=1)
+    text = advance.lower(solver, program(), start(solver, program()), 0, 2).as_text()
+    products = [line for line in text.splitlines() if "stablehlo.dot_general" in line]
+    assert products
+    assert all("precision = [HIGHEST, HIGHEST]" in line for line in products)

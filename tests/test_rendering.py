@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from mjx_drax import rendering
+from mjx_drax import host, rendering
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import Langevin
 from mjx_drax.restarts import Restarts
@@ -321,9 +321,9 @@ def test_interpolation_follows_geodesics() -> None:
     )
     quarter = np.array([np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)])
     poses, times = np.array([[1.0, 0.0, 0.0, 0.0], quarter]), np.array([0.0, 2.0])
-    middle = rendering._interpolate(model, poses, times, 1.0)
+    middle = host.interpolated(model, poses, times, 1.0)
     np.testing.assert_allclose(middle, [np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)], atol=1e-12)
-    np.testing.assert_array_equal(rendering._interpolate(model, poses, times, 2.0), quarter)
+    np.testing.assert_array_equal(host.interpolated(model, poses, times, 2.0), quarter)
 
 
 def test_bad_input_is_refused_before_drawing(tmp_path: Path) -> None:

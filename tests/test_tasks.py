@@ -9,7 +9,7 @@ import pytest
 
 from mjx_drax import tasks
 from mjx_drax.models import path
-from mjx_drax.tasks._distance import boxes, capsules
+from mjx_drax.tasks.quadrotor import BARS, MARGIN
 
 SIZES = {  # nq, nv, nu and K
     "double_pendulum_swingup": (3, 3, 1, 150),
@@ -105,27 +105,18 @@ def test_only_the_pairs_that_matter_can_touch(name):
     assert not any(host.geom_contype[g] and host.geom_conaffinity[g] for g in touching)
 
 
-@pytest.mark.parametrize(("name", "axes"), [("quadrotor_planar", "xz"), ("quadrotor", "xyz")])
-def test_distances_are_those_of_mujoco(name, axes):
-    """Against mj_geomDistance, from a small sphere that is moved about."""
-    host = model(name)
-    which = ["xyz".index(axis) for axis in axes]
-    distance = (boxes if name == "quadrotor_planar" else capsules)(
-        host, *([axes] if axes != "xyz" else [])
-    )
-    data = started(host)
-    hull = host.geom("hull").id
-    solid = (host.geom_bodyid == 0) & (host.geom_contype != 0)
-    rng = np.random.default_rng(0)
+def test_clearances_are_those_of_mujoco():
+    """Of the quadrotor, against mj_geomDistance, wherever it is."""
+    problem = problem_of("quadrotor")
+    host, u = problem.dynamics.mj_model, np.zeros(problem.dynamics.nu)
+    clearance = jax.jit(lambda x: problem.constraint(problem.dynamics.observe(x, u), u))
+    data, rng = started(host), np.random.default_rng(0)
+    hull, bars = host.geom("hull").id, [host.geom(name).id for name in BARS]
+    assert set(bars) == set(np.flatnonzero((host.geom_bodyid == 0) & (host.geom_contype != 0)))
     for _ in range(20):
-        data.qpos[:3] = rng.uniform([-3, -1.5 if axes == "xyz" else 0.3, 0.3], [3, 1.5, 2.5])
-        if axes == "xz":
-            data.qpos[2] = 0.0
+        data.qpos[:3] = rng.uniform([-3, -1.5, 0.3], [3, 1.5, 2.5])
         mujoco.mj_forward(host, data)
-        ours = np.asarray(distance(data.geom_xpos[hull][which]))
-        theirs = [
-            mujoco.mj_geomDistance(host, data, hull, g, 10.0, None) for g in np.flatnonzero(solid)
-        ]
+        ours = MARGIN - np.asarray(clearance(np.concatenate([data.qpos, data.qvel])))
+        theirs = [mujoco.mj_geomDistance(host, data, hull, g, 10.0, None) for g in bars]
         apart = np.array(theirs) > 0  # inside, MuJoCo's is another measure
-        off = ours - host.geom_size[hull, 0] - np.array(theirs)
-        assert np.abs(off[apart]).max(initial=0) < 1e-4
+        assert np.abs(ours - theirs)[apart].max(initial=0) < 1e-4
