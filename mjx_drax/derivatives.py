@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.dynamics import Static
 from mjx_drax.linalg import symmetric
-from mjx_drax.scalar import scalarized
+from mjx_drax.scalar import pruned, scalarized
 
 Function = Callable[[Array], Array]
 
@@ -46,16 +46,17 @@ class Autodiff:
 
     def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
         """Jacobian (m, n) and value (m,), one tangent for each of the n directions."""
+        lean = pruned(function)
 
         def with_value(dz: Array) -> tuple[Array, Array]:
-            value = function(dz)
+            value = lean(dz)
             return value, value
 
         return jax.jacfwd(with_value, has_aux=True)(jnp.zeros(size))
 
     def hessian(self, function: Function, size: int) -> Array:
         """Hessian (n, n)."""
-        return jax.jacfwd(jax.jacfwd(function))(jnp.zeros(size))
+        return jax.jacfwd(jax.jacfwd(pruned(function)))(jnp.zeros(size))
 
 
 @register_dataclass

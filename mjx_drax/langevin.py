@@ -46,6 +46,7 @@ from mjx_drax.precondition import (
 )
 from mjx_drax.problem import Problem, Stagewise, Trajectory
 from mjx_drax.quasi_newton import LBFGS
+from mjx_drax.scalar import pruned
 from mjx_drax.schedules import Constant, Geometric
 
 FEASIBLE = 1e-3
@@ -470,7 +471,12 @@ def advance(
     Both ends are traced: any number of iterations runs the same compiled loop, and none at all
     (start = stop) just compiles it.
     """
-    return jax.lax.fori_loop(start, stop, lambda i, s: solver.step(problem, s, i, tail), state)
+
+    @pruned  # jit does it to all but the bodies of loops
+    def step(i: Array, state: State) -> State:
+        return solver.step(problem, state, i, tail)
+
+    return jax.lax.fori_loop(start, stop, step, state)
 
 
 @jax.jit

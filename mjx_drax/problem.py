@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from mjx_drax.derivatives import Differentiator, positive_part
 from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
 from mjx_drax.errors import DraxError
+from mjx_drax.scalar import pruned
 
 CLOSE = 0.03
 """Smallest factor on the scatter of initial knots where f has kinks or states quaternions."""
@@ -232,13 +233,27 @@ class Problem:
         """Times of x_0..x_K, (K + 1,) [s]."""
         return float(self.dynamics.dt) * np.arange(self.horizon + 1)
 
+    # Of all that `observe` computes, these four keep what their readers read
+
+    @pruned
     def running_cost(self, x: Array, u: Array) -> Array:
         """l(x, u), scalar."""
         return self.running(self.dynamics.observe(x, u), u)
 
+    @pruned
     def terminal_cost(self, x: Array) -> Array:
         """phi(x), scalar."""
         return self.terminal(self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)))
+
+    @pruned
+    def running_constraint(self, x: Array, u: Array) -> Array:
+        """Constraints at a stage, [equality; inequality], (m,)."""
+        return self.constraint(self.dynamics.observe(x, u), u)
+
+    @pruned
+    def end_constraint(self, x: Array) -> Array:
+        """Constraints at the end, [equality; inequality], (m_end,)."""
+        return self.terminal_constraint(self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)))
 
     def with_start(self, trajectory: Trajectory) -> Array:
         """x_0..x_K, (..., K + 1, nx): the states with x_init in front."""
@@ -265,15 +280,8 @@ class Problem:
 
     def constraints(self, trajectory: Trajectory) -> Stagewise:
         """Values [equality; inequality] at the stages (K, m) and at the end (m_end,)."""
-        dynamics = self.dynamics
-
-        def stage(x: Array, u: Array) -> Array:
-            return self.constraint(dynamics.observe(x, u), u)
-
-        end = dynamics.observe(trajectory.x[-1], jnp.zeros(dynamics.nu))
-        return Stagewise(
-            jax.vmap(stage)(self.stages(trajectory), trajectory.u), self.terminal_constraint(end)
-        )
+        stages = jax.vmap(self.running_constraint)(self.stages(trajectory), trajectory.u)
+        return Stagewise(stages, self.end_constraint(trajectory.x[-1]))
 
     def with_slack(self, values: Stagewise, slack: Stagewise) -> Stagewise:
         """The equality constraints [equality; inequality + slack]."""

@@ -22,16 +22,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce, wraps
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.interpreters.partial_eval import dce_jaxpr
 
 LIMIT = 8_000
 """Scalar operations of a function, above which it is left as it is: XLA would compile for longer
 than it takes for the array operations."""
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 Scalar = Any
 """A known number (np.generic) or a traced scalar of shape ()."""
@@ -53,15 +56,46 @@ def scalarized(function: Callable[..., Any], limit: int = LIMIT) -> Callable[...
 
     @wraps(function)
     def in_scalars(*arguments: Any) -> Any:
-        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-        flat = jax.tree.leaves(arguments)
+        closed, flat, tree = _traced(function, arguments)
         try:
             outputs = _Evaluation(limit).outputs(closed, flat)
-        except (Unsupported, TypeError):  # types: constants that jax kept from another precision
-            outputs = jaxpr_as_fun(closed)(*flat)
-        return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
+        except (Unsupported, TypeError):  # types: as in `pruned`
+            outputs = _in_arrays(closed, flat)
+        return jax.tree.unflatten(tree, outputs)
 
     return in_scalars
+
+
+def _in_arrays(closed: ClosedJaxpr, flat: Sequence[Any]) -> list[Any]:
+    return jaxpr_as_fun(closed)(*flat)
+
+
+def pruned(function: Function) -> Function:
+    """The same function of pytrees of arrays, without the operations that its result does not need.
+
+    XLA drops these, but only after JAX has differentiated and lowered them; and a step of physics
+    computes much that a cost does not read.
+    """
+
+    @wraps(function)
+    def lean(*arguments: Any) -> Any:
+        closed, flat, tree = _traced(function, arguments)
+        try:
+            return jax.tree.unflatten(tree, jaxpr_as_fun(closed)(*flat))
+        except TypeError:  # constants that jax kept from another precision
+            return function(*arguments)
+
+    return cast(Function, lean)
+
+
+def _traced(
+    function: Callable[..., Any], arguments: tuple[Any, ...]
+) -> tuple[ClosedJaxpr, list[Any], Any]:
+    """What the function computes and its result needs, its inputs, and the result's structure."""
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+    tree = jax.tree.structure(shapes)
+    return closed.replace(jaxpr=jaxpr), jax.tree.leaves(arguments), tree
 
 
 class _Evaluation:

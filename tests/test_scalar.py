@@ -11,7 +11,7 @@ from jax import lax
 from mjx_drax import from_mjcf, mjcf, scalar
 from mjx_drax.derivatives import Autodiff, InScalars
 from mjx_drax.models import path
-from mjx_drax.scalar import scalarized
+from mjx_drax.scalar import pruned, scalarized
 
 RNG = np.random.default_rng(0)
 A = RNG.uniform(0.5, 2.0, (3, 4))
@@ -120,7 +120,7 @@ def strictly(monkeypatch):
     def refuse(closed):
         raise AssertionError("fell back")
 
-    monkeypatch.setattr(scalar, "jaxpr_as_fun", refuse)
+    monkeypatch.setattr(scalar, "_in_arrays", refuse)
 
 
 @pytest.mark.parametrize("x64", [False, True])
@@ -360,3 +360,22 @@ def test_dynamics_survive_as_a_pytree():
     x, u = jnp.array([0.3, 0.2]), jnp.array([0.1])
     seen = jax.vmap(lambda dynamics: dynamics.step(x, u))(many)
     np.testing.assert_allclose(seen, [after(dynamics)] * 2, rtol=1e-6)
+
+
+def test_pruned_keeps_what_the_result_needs_inside_of_functions_too():
+    """And loses the rest before it is differentiated; what is closed over may be traced."""
+
+    @jax.jit
+    def observe(x):
+        return {"sine": jnp.sin(x), "loop": jax.lax.fori_loop(0, 3, lambda i, y: 2 * y, x)}
+
+    def derivative(scale, x):
+        return jax.jvp(pruned(lambda x: scale * observe(x)["sine"]), (x,), (jnp.ones(2),))
+
+    x = jnp.array([0.3, 1.0])
+    text = str(jax.make_jaxpr(derivative)(2.0, x))
+    assert "sin" in text
+    assert "scan" not in text
+    value, slope = jax.jit(derivative)(2.0, x)
+    np.testing.assert_allclose(value, 2 * np.sin(x), rtol=1e-6)
+    np.testing.assert_allclose(slope, 2 * np.cos(x), rtol=1e-6)
