@@ -9,7 +9,10 @@ only has to bring its own `difference` and `integrate`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from types import CellType, CodeType, FunctionType, MethodType
 from typing import Any
 
 import jax
@@ -158,8 +161,10 @@ class FunctionDynamics(Dynamics):
         limits: tuple[np.ndarray, np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and controls under u_k + K_k (x_k - plan_k) with f in float64; see `Dynamics`."""
+        f = self.function
+        own = replace(self, function=Partial(_with_own_arrays(f.func), *f.args, **f.keywords))
         with jax.enable_x64(True):
-            states, applied = _replay(*jax.tree.map(_double, (self, plan, u, gains, limits)))
+            states, applied = _replay(*jax.tree.map(_double, (own, plan, u, gains, limits)))
             return np.asarray(states), np.asarray(applied)
 
 
@@ -167,6 +172,52 @@ def _double(leaf: Any) -> Any:
     """The same number or array in float64, if it is one of floats."""
     array = np.asarray(leaf)
     return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else leaf
+
+
+@lru_cache
+def _with_own_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, with copies of the numpy arrays that it and its helpers refer to.
+
+    JAX knows an array by its identity, in the precision in which it first saw it, and a function
+    that was traced in float32 then fails in float64.
+    """
+    return _copied(function, {})
+
+
+def _copied(value: Any, seen: dict[int, Any]) -> Any:
+    """A copy of arrays, and of containers, methods and functions that hold them; else the same."""
+    if id(value) in seen:
+        return seen[id(value)]
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if type(value) in (list, tuple):
+        return type(value)(_copied(entry, seen) for entry in value)
+    if type(value) is dict:
+        return {key: _copied(entry, seen) for key, entry in value.items()}
+    if isinstance(value, MethodType):
+        owner = copy(value.__self__)
+        for name, entry in vars(value.__self__).items():
+            object.__setattr__(owner, name, _copied(entry, seen))
+        return MethodType(_copied(value.__func__, seen), owner)
+    if not isinstance(value, FunctionType) or value.__module__.split(".")[0] in ("jax", "numpy"):
+        return value
+    names = dict(value.__globals__)
+    cells = tuple(CellType() for _ in value.__closure__ or ())
+    new = FunctionType(value.__code__, names, value.__name__, value.__defaults__, cells)
+    new.__kwdefaults__ = value.__kwdefaults__
+    seen[id(value)] = new
+    for cell, old in zip(cells, value.__closure__ or (), strict=True):
+        cell.cell_contents = _copied(old.cell_contents, seen)
+    for name in _names(value.__code__):
+        if name in names:
+            names[name] = _copied(names[name], seen)
+    return new
+
+
+def _names(code: CodeType) -> set[str]:
+    """Names of globals that a function may use, those of functions inside it included."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names, inner))
 
 
 @jax.jit

@@ -376,3 +376,47 @@ def test_cartpole_swings_up_from_mjcf():
     assert f"MuJoCo {mujoco.__version__} C engine" in solution.certificate.engine
     assert solution.certificate.feedback["max_deviation"] < 0.01
     assert solution.cost[solution.best_chain] < 0.3
+
+
+DRIFT = np.array([[1.0, 0.1], [0.0, 1.0]])
+PUSH = {"gain": np.array([0.0, 0.1])}
+
+
+class Plant:
+    """A double integrator whose numbers are numpy arrays wherever a user may have them."""
+
+    def __init__(self):
+        self.offset = np.array([1 / 3, 0.0])
+
+    def step(self, x, u):
+        return pushed(x, u) + 0.1 * self.offset
+
+
+def pushed(x, u):
+    return DRIFT @ x + PUSH["gain"] * u[0]
+
+
+def in_closure():
+    offset = np.array([1 / 3, 0.0])
+    return lambda x, u: pushed(x, u) + 0.1 * offset
+
+
+@pytest.mark.parametrize("f", [in_closure(), Plant().step], ids=["closure", "method"])
+def test_functions_may_hold_numpy_arrays(f):
+    """Which JAX would remember in the precision of the solve, and then not replay in float64."""
+    target = np.array([0.5, 0.1])
+    problem = from_function(
+        f,
+        x_init=[0.0, 0.0],
+        nu=1,
+        dt=0.1,
+        horizon=0.5,
+        terminal_residual=lambda x: 10.0 * (x - target),
+        running_residual=lambda x, u: 0.1 * u,
+    )
+    solver = Langevin(iterations=2, tail=8)
+    solution = solve(problem, chains=2, solver=solver)
+    assert solution.open_loop.max_deviation.max() < 1e-5
+    states, controls = solution.open_loop.states[0], solution.open_loop.controls[0]
+    for x, u, reached in zip(states[:-1], controls, states[1:], strict=True):
+        np.testing.assert_allclose(reached, f(x, u), rtol=1e-14)
