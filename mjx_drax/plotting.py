@@ -335,12 +335,13 @@ def _draw_history(
     band.set_label("smallest to largest")
     handles: list[Artist] = [*axes.plot(iterations, median, ".-", ms=3, lw=1.6, color=color)]
     handles[0].set_label("median")
-    marks = [mark for mark in solution.solver.noise_ends if 0 < mark <= iterations[-1]]
-    for mark in marks:
-        line = axes.axvline(mark, ls="--", lw=1, color=GRAY)
-    if marks:
-        line.set_label("noise ends")
-        handles.append(line)
+    for name, dash, label in (("began", "-", "next attempt"), ("noise_ends", "--", "noise ends")):
+        marks = [at for at in solution.history[name] if 0 < at <= iterations[-1]]
+        for mark in marks:
+            line = axes.axvline(mark, ls=dash, lw=1, color=GRAY, zorder=1)
+        if marks:
+            line.set_label(label)
+            handles.append(line)
     axes.set_xlim(0, max(1, iterations[-1]))
     return [*handles, band]
 

@@ -26,23 +26,24 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from mjx_drax import movie
 from mjx_drax._mujoco import APT_EGL, mujoco
 from mjx_drax.errors import DraxError
 from mjx_drax.host import interpolated
+from mjx_drax.movie import Frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from PIL import ImageFont
 
     from mjx_drax.solution import Solution
 
-Frame = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.floating[Any]]
+
+FREE = "free"
+"""The camera that frames the whole motion by itself."""
 
 _HOLD = 0.5  # [s] the last frame stays this long
 _DRAWN_INCHES = 5.0  # height of a drawn frame: sets the size of its letters
-_UNCERTIFIED = "NOT CERTIFIED"  # these words in an overlay turn its box red
-_CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
 _GL_OFF = ("off", "0", "false", "disable", "disabled")
 
 
@@ -60,6 +61,7 @@ def render(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
+    speed: float = 1.0,
     draw: Callable[[Axes, np.ndarray], None] | None = None,
 ) -> Path:
     """Films the best chain's motion as it was replayed, not as it was planned; returns the path.
@@ -69,15 +71,17 @@ def render(
 
     Args:
       solution: from `solve`.
-      path: where to, ending in .mp4; its folder is made if need be.
+      path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       fps: frames per second.
       size: (height, width) [pixels].
       camera: a camera of the model, see `render_frames`.
+      speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
         for problems without a model (others do not use it).
 
     Raises:
-      DraxError: a path, size, fps or camera that cannot be used, or neither a model nor `draw`.
+      DraxError: a path, size, fps, speed or camera that cannot be used, or neither a model nor
+        `draw`.
     """
     problem = solution.problem
     model = getattr(problem.dynamics, "mj_model", None)
@@ -87,15 +91,23 @@ def render(
     if model is not None:
         qpos = states[:, : model.nq]
         return render_motion(
-            model, qpos, times, path, overlay=overlay, fps=fps, size=size, camera=camera
+            model,
+            qpos,
+            times,
+            path,
+            overlay=overlay,
+            fps=fps,
+            size=size,
+            camera=camera,
+            speed=speed,
         )
     if draw is None:
         raise DraxError(
             f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
             "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
         )
-    frames = _drawn_frames(draw, states, _instants(times, fps), times, overlay, size)
-    return _write_video(path, frames, fps, size)
+    frames = _drawn_frames(draw, states, frame_times(times, fps, speed), times, overlay, size)
+    return movie.write(path, frames, fps, size)
 
 
 def _overlay(solution: Solution) -> list[str]:
@@ -116,7 +128,7 @@ def _overlay(solution: Solution) -> list[str]:
     if not solution.certified:
         breach = "the plan breaks the dynamics"
         reason = "no replay succeeds" if solution.feasible[chain] else breach
-        lines.insert(1, f"{_UNCERTIFIED}: {reason}")
+        lines.insert(1, f"{movie.UNCERTIFIED}: {reason}")
     return lines
 
 
@@ -130,45 +142,15 @@ def render_motion(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
+    speed: float = 1.0,
 ) -> Path:
-    """Writes a motion as an H.264 mp4 that browsers play, and returns its path.
+    """Films a motion as an H.264 mp4 that browsers play, or as .gif or .webp; returns the path.
 
-    The arguments are those of `render_frames`; `path` ends in .mp4, and its folder is made if
-    need be. The file appears once it is complete. Raises DraxError before anything is drawn.
+    The arguments are those of `render_frames`; the path's folder is made if need be. The file
+    appears once it is complete. Raises DraxError before anything is drawn.
     """
-    frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
-    return _write_video(path, frames, fps, size)
-
-
-def _write_video(
-    path: str | os.PathLike[str],
-    frames: Generator[Frame, None, None],
-    fps: float,
-    size: tuple[int, int],
-) -> Path:
-    """Writes frames of a size, rounded up to even, as an H.264 mp4 that browsers play."""
-    target = _video_path(path)
-    partial = target.with_name(f".{target.stem}.partial.mp4")
-    try:
-        partial.touch()
-    except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
-
-    import imageio_ffmpeg
-    import mediapy
-
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())  # so that pip alone is enough
-    try:
-        with mediapy.VideoWriter(
-            partial, _even(size), fps=fps, crf=_CRF, ffmpeg_args=("-movflags", "+faststart")
-        ) as writer:
-            for frame in frames:
-                writer.add_image(frame)
-        partial.replace(target)
-    finally:
-        frames.close()
-        partial.unlink(missing_ok=True)
-    return target
+    frames = _frames(model, qpos, times, overlay, fps, size, camera, speed)
+    return movie.write(path, frames, fps, size)
 
 
 def render_frames(
@@ -180,6 +162,7 @@ def render_frames(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
+    speed: float = 1.0,
 ) -> Frame:
     """Frames (N, height, width, 3) uint8 of a motion, the last one held for half a second.
 
@@ -190,13 +173,14 @@ def render_frames(
       overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
       fps: frames per second.
       size: (height, width) [pixels]; odd ones are made even, which players ask for.
-      camera: a camera's name or index; None takes the one called "main", or, in a model without
-        one, a free camera that frames the whole motion.
+      camera: a camera's name or index; "free" is one that frames the whole motion by itself. None
+        takes the one called "main", or, in a model without one, the free one.
+      speed: of the motion; 0.5 is slow motion.
 
     Raises:
       DraxError: positions of the wrong shape or not finite, decreasing times, unknown camera.
     """
-    frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
+    frames = _frames(model, qpos, times, overlay, fps, size, camera, speed)
     return np.stack(list(frames))
 
 
@@ -204,30 +188,30 @@ def _frames(
     model: mujoco.MjModel,
     qpos: npt.ArrayLike,
     times: npt.ArrayLike,
-    *,
     overlay: Sequence[str],
     fps: float,
     size: tuple[int, int],
     camera: str | int | None,
+    speed: float,
 ) -> Generator[Frame, None, None]:
     """Checks everything now, draws one frame at a time later."""
     positions, instants = _checked_motion(model, qpos, times)
-    at = _instants(instants, fps)
+    at = frame_times(instants, fps, speed)
     if isinstance(overlay, str):
         raise DraxError(f"overlay is a sequence of lines, not one string: [{overlay!r}]")
-    height, width = _even(size)
-    view = _camera(model, positions, camera, width / height)
+    height, width = movie.even(size)
+    view = view_of(model, positions, camera, width / height)
 
     def draw() -> Generator[Frame, None, None]:
         data = mujoco.MjData(model)
         scene = mujoco.MjvScene(model, maxgeom=10_000)
         option = mujoco.MjvOption()
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        with _drawer(model, height, width) as drawer:
+        with open_drawer(model, height, width) as drawer:
             for time in at:
-                _pose(model, data, interpolated(model, positions, instants, time))
+                set_pose(model, data, interpolated(model, positions, instants, time))
                 mujoco.mjv_updateScene(model, data, option, None, view, everything, scene)
-                yield _write(drawer.render(scene), overlay, time)
+                yield movie.captioned(drawer.render(scene), overlay, time)
 
     return draw()
 
@@ -241,7 +225,7 @@ def _drawn_frames(
     size: tuple[int, int],
 ) -> Generator[Frame, None, None]:
     """Frames at some instants of states (T, nx), drawn anew at each knot, below the overlay."""
-    height, width = _even(size)
+    height, width = movie.even(size)
 
     def frames() -> Generator[Frame, None, None]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -249,7 +233,7 @@ def _drawn_frames(
         from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         dpi = height / _DRAWN_INCHES
-        top = 1.0 - _text_box(overlay, height, width)[1][3] / height
+        top = 1.0 - movie.text_box(overlay, height, width)[1][3] / height
         layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, top))
         figure = Figure(((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout=layout)
         canvas = FigureCanvasAgg(figure)
@@ -261,17 +245,19 @@ def _drawn_frames(
                 draw(figure.add_subplot(), states[: knot + 1])
                 canvas.draw()
                 drawn, picture = knot, np.array(canvas.buffer_rgba())[..., :3]
-            yield _write(picture, overlay, time)
+            yield movie.captioned(picture, overlay, time)
 
     return frames()
 
 
-def _instants(times: Floats, fps: float) -> Floats:
+def frame_times(times: Floats, fps: float, speed: float = 1.0) -> Floats:
     """When frames are taken of a motion between times (T,) [s]: its end is held."""
-    if not (np.isfinite(fps) and fps > 0.0):
-        raise DraxError(f"fps must be positive, not {fps}")
-    count = int((times[-1] - times[0]) * fps + 1e-6) + 1
-    at = times[0] + np.arange(count) / fps
+    for name, value in (("fps", fps), ("speed", speed)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise DraxError(f"{name} must be positive, not {value}")
+    step = speed / fps
+    count = int((times[-1] - times[0]) / step + 1e-6) + 1
+    at = times[0] + np.arange(count) * step
     return np.append(at, np.full(round(_HOLD * fps), times[-1]))
 
 
@@ -293,28 +279,7 @@ def _checked_motion(
     return positions, instants
 
 
-def _even(size: tuple[int, int]) -> tuple[int, int]:
-    """The size, rounded up to even numbers: yuv420p halves both sides."""
-    height, width = (int(side) for side in size)
-    if not (16 <= height <= 8192 and 16 <= width <= 8192):
-        raise DraxError(f"size (height, width) must lie within 16 and 8192 pixels, not {size}")
-    return height + height % 2, width + width % 2
-
-
-def _video_path(path: str | os.PathLike[str]) -> Path:
-    target = Path(path).expanduser()
-    if target.suffix.lower() != ".mp4":
-        raise DraxError(f"a video is written as .mp4, not {target.name!r}")
-    if target.is_dir():
-        raise DraxError(f"cannot write {target}: it is a folder")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
-    return target
-
-
-def _pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
+def set_pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
     """Sets the position and computes what a scene shows; no collisions, no forces."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -326,18 +291,19 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
 # Cameras
 
 
-def _camera(
+def view_of(
     model: mujoco.MjModel, qpos: Floats, wanted: str | int | None, aspect: float
 ) -> mujoco.MjvCamera:
+    """The camera asked for, as in `render_frames`, for a motion qpos (T, nq)."""
     names = [model.camera(index).name for index in range(model.ncam)]
     if wanted is None:
-        if "main" not in names:
-            return _framing_camera(model, qpos, aspect)
-        wanted = "main"
+        wanted = "main" if "main" in names else FREE
+    if wanted == FREE and FREE not in names:
+        return _framing_camera(model, qpos, aspect)
     index = names.index(wanted) if wanted in names else wanted
     if isinstance(index, str) or not 0 <= index < model.ncam:
         known = ", ".join(name or f"{i} (unnamed)" for i, name in enumerate(names)) or "none"
-        raise DraxError(f"no camera {wanted!r} in this model; its cameras: {known}")
+        raise DraxError(f"no camera {wanted!r} in this model: use {FREE!r}, or of its own: {known}")
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FIXED
     view.fixedcamid = index
@@ -353,7 +319,7 @@ def _framing_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoc
     poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, 60).astype(int))]
     places = np.empty((len(poses), int(chosen.sum()), 3))
     for place, pose in zip(places, poses, strict=True):
-        _pose(model, data, pose)
+        set_pose(model, data, pose)
         place[:] = data.geom_xpos[chosen]
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -370,77 +336,11 @@ def _framing_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoc
     return view
 
 
-# Text
-
-
-def _write(frame: Frame, lines: Sequence[str], time: float) -> Frame:
-    """The frame with lines of text in a translucent box at its top left."""
-    if not lines:
-        return frame
-    from PIL import Image, ImageDraw
-
-    height, width = frame.shape[:2]
-    font, box = _text_box(lines, height, width)
-    text = "\n".join(lines).replace("{time}", f"{time:.2f} s")
-    image = Image.fromarray(frame)
-    draw = ImageDraw.Draw(image, "RGBA")
-    margin = height // 40
-    fill = (150, 20, 20, 210) if _UNCERTIFIED in text else (14, 18, 25, 185)
-    draw.rounded_rectangle(box, radius=margin // 2, fill=fill)
-    corner = (2 * margin, 2 * margin)
-    draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
-    return np.asarray(image)
-
-
-def _text_box(
-    lines: Sequence[str], height: int, width: int
-) -> tuple[ImageFont.FreeTypeFont, tuple[float, float, float, float]]:
-    """The font, and the box (left, top, right, bottom) around the text with its margin."""
-    from PIL import Image, ImageDraw
-
-    text = "\n".join(lines).replace("{time}", "00.00 s")
-    font = _fitted_font(text, height, width)
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    corner = (2 * margin, 2 * margin)
-    left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
-    return font, (left - margin, top - margin, right + margin, bottom + margin)
-
-
-@lru_cache(maxsize=16)
-def _fitted_font(text: str, height: int, width: int) -> ImageFont.FreeTypeFont:
-    """The largest font, up to 1/28 of the height, with which the text fits the frame."""
-    from PIL import Image, ImageDraw
-
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    for size in range(max(9, height // 28), 8, -1):
-        font = _font(size)
-        box = draw.multiline_textbbox((0, 0), text, font, spacing=margin // 2)
-        if box[2] <= width - 4 * margin and box[3] <= height - 4 * margin:
-            break
-    return font
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans (it has mathematical signs), which matplotlib brings; else Pillow's own."""
-    from PIL import ImageFont
-
-    found = importlib.util.find_spec("matplotlib")  # located, not imported: that takes a second
-    if found is not None and found.origin is not None:
-        path = Path(found.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"
-        if path.exists():
-            return ImageFont.truetype(str(path), size)
-    font = ImageFont.load_default(size)
-    assert isinstance(font, ImageFont.FreeTypeFont)
-    return font
-
-
 # OpenGL
 
 
 @contextlib.contextmanager
-def _drawer(model: mujoco.MjModel, height: int, width: int) -> Iterator[Drawer]:
+def open_drawer(model: mujoco.MjModel, height: int, width: int) -> Iterator[Drawer]:
     """OpenGL if this machine has it, else the painter."""
     context = _gl_context()
     if context is None:

@@ -91,7 +91,7 @@ def test_one_chain(tmp_path: Path) -> None:
 def test_diverged_chains_and_replays(pendulum: Solution, kind: str, tmp_path: Path) -> None:
     died = np.arange(8) >= (3 if kind == "some" else 0)
     history = {
-        "iteration": pendulum.history["iteration"],
+        **pendulum.history,
         "cost": np.where(died, np.nan, pendulum.history["cost"]),
         "max_defect": np.where(died, np.nan, pendulum.history["max_defect"]),
     }
