@@ -335,11 +335,14 @@ def _draw_history(
     band.set_label("smallest to largest")
     handles: list[Artist] = [*axes.plot(iterations, median, ".-", ms=3, lw=1.6, color=color)]
     handles[0].set_label("median")
-    for name, dash, label in (("began", "-", "next attempt"), ("noise_ends", "--", "noise ends")):
-        marks = [at for at in solution.history[name] if 0 < at <= iterations[-1]]
+    began, ended = solution.history["began"], solution.history["noise_ends"]
+    for marks, dash, label in (
+        (began[1:], "-", "next attempt"),
+        (ended[ended > began], "--", "noise ends"),
+    ):
         for mark in marks:
             line = axes.axvline(mark, ls=dash, lw=1, color=GRAY, zorder=1)
-        if marks:
+        if len(marks):
             line.set_label(label)
             handles.append(line)
     axes.set_xlim(0, max(1, iterations[-1]))

@@ -42,6 +42,7 @@ Floats = npt.NDArray[np.floating[Any]]
 FREE = "free"
 """The camera that frames the whole motion by itself."""
 
+_MARGIN = 1.1  # of the free camera's distance
 _HOLD = 0.5  # [s] the last frame stays this long
 _DRAWN_INCHES = 5.0  # height of a drawn frame: sets the size of its letters
 _GL_OFF = ("off", "0", "false", "disable", "disabled")
@@ -87,7 +88,7 @@ def render(
     model = getattr(problem.dynamics, "mj_model", None)
     states = solution.replayed[0]
     shown = int(np.cumprod(np.isfinite(states).all(axis=1)).sum())
-    states, times, overlay = states[:shown], problem.times[:shown], _overlay(solution)
+    states, times, overlay = states[:shown], problem.times[:shown], outcome_lines(solution)
     if model is not None:
         qpos = states[:, : model.nq]
         return render_motion(
@@ -110,7 +111,7 @@ def render(
     return movie.write(path, frames, fps, size)
 
 
-def _overlay(solution: Solution) -> list[str]:
+def outcome_lines(solution: Solution) -> list[str]:
     """Lines of text for a film, short ones, which leave the robot in view."""
     chain, mode = solution.best_chain, solution.replay_mode
     cost, defect, violation = (
@@ -311,29 +312,54 @@ def view_of(
 
 
 def _framing_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoco.MjvCamera:
-    """A free camera that sees every moving geom in every pose of the motion."""
+    """A free camera that sees every moving geom in every pose of the motion.
+
+    It looks the way the camera called "main" does at first, if there is one.
+    """
     data = mujoco.MjData(model)
     sized = model.geom_rbound > 0.0  # planes have none
     moving = sized & (model.body_weldid[model.geom_bodyid] != 0)
     chosen = moving if np.any(moving) else sized
-    poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, 60).astype(int))]
+    poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, 240).astype(int))]
     places = np.empty((len(poses), int(chosen.sum()), 3))
     for place, pose in zip(places, poses, strict=True):
         set_pose(model, data, pose)
         place[:] = data.geom_xpos[chosen]
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
-    view.azimuth, view.elevation = 110.0, -12.0
-    radius = float(model.stat.extent)
-    view.lookat[:] = model.stat.center
+    view.azimuth, view.elevation = _direction(model)
+    center, bound = model.stat.center, np.array([model.stat.extent])
     if places.size:
-        bound = model.geom_rbound[chosen][:, None]
-        center = ((places - bound).min(axis=(0, 1)) + (places + bound).max(axis=(0, 1))) / 2.0
-        radius = float((np.linalg.norm(places - center, axis=-1) + bound[:, 0]).max())
-        view.lookat[:] = center
-    half_angle = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * min(1.0, aspect))
-    view.distance = 1.05 * radius / np.sin(half_angle)
+        center = (places.min(axis=(0, 1)) + places.max(axis=(0, 1))) / 2.0
+        bound = np.tile(model.geom_rbound[chosen], len(places))
+    azimuth, elevation = np.radians([view.azimuth, view.elevation])
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    ahead = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([flat[1], -flat[0], 0.0])
+    axes = np.array([right, np.cross(right, ahead), ahead])
+    across, up, depth = axes @ (places.reshape(-1, 3) - center).T if places.size else np.zeros(3)
+    half = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * np.array([aspect, 1.0]))
+    distance, shift = 0.0, np.zeros(2)
+    for i, (offset, angle) in enumerate(zip((across, up), half, strict=True)):
+        low, high = np.min(offset - bound), np.max(offset + bound)
+        shift[i] = (low + high) / 2.0
+        reach = (np.abs(offset - shift[i]) * np.cos(angle) + bound) / np.sin(angle) - depth
+        distance = max(distance, float(reach.max()))
+    view.lookat[:] = center + shift @ axes[:2]
+    view.distance = _MARGIN * distance
     return view
+
+
+def _direction(model: mujoco.MjModel) -> tuple[float, float]:
+    """Azimuth and elevation [degrees] of the camera called "main", or usual ones."""
+    main = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA.value, "main")
+    if main < 0:
+        return 110.0, -12.0
+    data = mujoco.MjData(model)
+    set_pose(model, data, model.qpos0)
+    ahead = -data.cam_xmat[main].reshape(3, 3)[:, 2]
+    azimuth, elevation = np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(ahead[2], -1.0, 1.0))
+    return float(np.degrees(azimuth)), float(np.degrees(elevation))
 
 
 # OpenGL

@@ -166,7 +166,7 @@ class Run(Attempt):
 
     `records` holds what every place in the batch was at, which in later attempts are other tries
     of fewer chains. `began` holds for every attempt after how many iterations it began, and after
-    how many its iterations with noise end.
+    how many its noise ended (the same, if it had none).
     """
 
     records: list[tuple[int, Info]]
@@ -328,7 +328,8 @@ class _Search:
         self, flow: Langevin, state: State, info: Info, owners: np.ndarray, expected: int
     ) -> tuple[Attempt, bool]:
         """One attempt on behalf of owners (chains,), and whether it was not interrupted."""
-        self.began.append((self.done, self.done + int(flow.iterations)))
+        noisy = int(flow.iterations) if flow.sigma(0) > 0.0 else 0
+        self.began.append((self.done, self.done + noisy))
         if self.recorder is not None:
             self.recorder.begin(owners)
         self._snap(flow, 0, state, info)

@@ -100,7 +100,7 @@ class Solution:
         history: `iteration` (records,), and `cost`, `max_defect` (records, chains) of every place
             in the batch, which in later attempts of `Restarts` hold tries for unfinished chains;
             `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
-            its iterations with noise end.
+            its noise ended (the same, if it had none).
         iterations: how many were done.
         compile_time, solve_time: [s].
         recording: the chains' knots over the iterations, where `solve` was asked to record them.

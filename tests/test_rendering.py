@@ -248,7 +248,7 @@ def test_overlay_says_what_is_certified(
 ) -> None:
     for solution, engine in ((cartpole, "MuJoCo C replay"), (pendulum, "float64 rollout")):
         judged = _judged(solution, feasible, open_loop, feedback)
-        lines = rendering._overlay(judged)
+        lines = rendering.outcome_lines(judged)
         assert lines[0] == judged.problem.name
         assert (f"NOT CERTIFIED: {warning}" == lines[1]) == (not judged.certified)
         defect = "1e-06" if feasible else "0.1"
