@@ -26,7 +26,7 @@ from mjx_drax.host import between, interpolated, moved
 from mjx_drax.langevin import FEASIBLE
 from mjx_drax.movie import Frame
 from mjx_drax.recording import Path
-from mjx_drax.rendering import FREE, frame_times, open_drawer, outcome_lines, view_of
+from mjx_drax.rendering import FREE, check, frame_times, open_drawer, outcome_lines, view_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,12 +37,15 @@ if TYPE_CHECKING:
 
 Floats = npt.NDArray[np.floating[Any]]
 
-COLORS = ("#56B4E9", "#F4F1E6", "#F0A830", "#C8400A")
+COLORS = ("#56B4E9", "#E8D44D", "#F0902A", "#C8400A")
 """Colors of defects, from feasible to the worst: blue to orange, safe for colour-blind readers."""
 
+_SECONDS, _MORE_SECONDS = 7.0, 2.0  # [s] that one try takes, and each further one
 _FIRST, _LAST = 0.6, 0.8  # [s] the scattered knots, and the last iteration, stay this long
 _EVEN = 0.25  # share of film time that is spread evenly over the iterations
+_EXACT = 1e-9  # smaller max|h| is drawn as this, on a logarithmic axis
 _INK, _PAPER, _LINE = "#e8ebf0", "#0e1219", "#56B4E9"
+_PARTS, _COUNT = 300, (6, 24)  # geoms of all ghosts, and range of their number, by default
 _STRIP = 0.24  # share of the height that the curves take
 _GHOST, _FAINT = 0.62, 0.13  # opacity of ghosts, while knots condense and while the motion plays
 _FEWER = 3  # while it plays, only every so many are left
@@ -52,8 +55,8 @@ def render_diffusion(
     solution: Solution,
     path: str | os.PathLike[str],
     *,
-    seconds: float = 7.0,
-    ghosts: int = 24,
+    seconds: float | None = None,
+    ghosts: int | None = None,
     chains: int = 6,
     fps: float = 30.0,
     size: tuple[int, int] = (600, 800),
@@ -70,8 +73,9 @@ def render_diffusion(
     Args:
       solution: from `solve(..., record=1)`.
       path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
-      seconds: that the diffusion takes in the film [s].
-      ghosts: number of knots at which the robot is shown.
+      seconds: that the diffusion takes in the film [s]; by default 7, and 2 for each further try.
+      ghosts: number of knots at which the robot is shown; by default 24, or fewer if it has many
+        parts, which take long to draw without a GPU.
       chains: number of chains whose paths are shown, those of distinct optima first.
       fps: frames per second.
       size: (height, width) [pixels].
@@ -89,27 +93,28 @@ def render_diffusion(
             f"this solution of {solution.problem.name} holds no recording: call "
             "solve(..., record=1), or mjx-drax solve --film FILE."
         )
+    check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
     for name, value in (("seconds", seconds), ("ghosts", ghosts), ("chains", chains)):
-        if not (np.isfinite(value) and value > 0):
+        if value is not None and not (np.isfinite(value) and value > 0):
             raise DraxError(f"{name} must be positive, not {value}")
+    shown = [recording.path(chain) for chain in _chains(solution, chains)]
+    if seconds is None:
+        seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
     height, width = movie.even(size)
     below = 2 * round(_STRIP * height / 2)
     states = solution.replayed[0]
-    states = states[np.isfinite(states).all(axis=1)]
+    states = states[: int(np.cumprod(np.isfinite(states).all(axis=1)).sum())]
     instants = frame_times(solution.problem.times[: len(states)], fps, speed)
-    shown = [recording.path(chain) for chain in _chains(solution, chains)]
+    lines = outcome_lines(solution)
     colors = Colors.of(shown[0])
     picture: Picture
     model = getattr(solution.problem.dynamics, "mj_model", None)
     if model is not None:
-        picture = Ghosts(model, solution, shown, states, colors, int(ghosts), camera)
-    elif draw is not None:
-        picture = Drawing(draw, solution, shown, states, colors)
+        picture = Ghosts(model, solution, shown, states, colors, ghosts, camera)
     else:
-        raise DraxError(
-            f"{solution.problem.name} has no model to film: pass draw=, a function draw(axes, "
-            "states) that draws states x_0..x_k (k + 1, nx) on matplotlib axes."
-        )
+        assert draw is not None  # as checked
+        left = movie.text_box(lines, height - below, width)[1][2] / width
+        picture = Drawing(draw, solution, shown, states, colors, left)
 
     def frames() -> Generator[Frame, None, None]:
         strip = Strip(shown[0], colors, below, width)
@@ -117,7 +122,7 @@ def render_diffusion(
             for at in _positions(shown[0], seconds, fps):
                 frame = movie.captioned(knots(at), _caption(solution, shown[0], at), 0.0)
                 yield np.concatenate([frame, strip.frame(at)])
-            end, lines = strip.frame(len(shown[0].iteration) - 1.0), outcome_lines(solution)
+            end = strip.frame(len(shown[0].iteration) - 1.0)
             for time in instants:
                 frame = movie.captioned(motion(time), lines, time)
                 yield np.concatenate([frame, end])
@@ -137,7 +142,7 @@ def _positions(path: Path, seconds: float, fps: float) -> Floats:
     """Where each frame is among the snapshots: 2.5 is half way between the third and the fourth."""
     logs = np.log10(np.maximum(path.defects, FEASIBLE))
     fall = np.abs(np.diff(logs, axis=0)).mean(axis=1)
-    scale = np.std(path.x[0], axis=0) + 1e-9
+    scale = np.std(path.x, axis=(0, 1)) + 1e-9
     motion = (np.abs(np.diff(path.x, axis=0)).mean(axis=1) / scale).mean(axis=1)
     same = np.diff(path.attempt) == 0
     pace = np.where(same, fall / max(fall[same].sum(), 1e-9), 0.0)
@@ -181,7 +186,8 @@ class Colors:
     @staticmethod
     def of(path: Path) -> Colors:
         """The scale for a chain: up to the next power of ten above its first defects."""
-        worst = np.nanmax(path.defects[0], initial=10.0 * FEASIBLE)
+        first = path.defects[0]
+        worst = np.max(first[np.isfinite(first)], initial=10.0 * FEASIBLE)
         return Colors(float(10.0 ** np.ceil(np.log10(worst) - 0.3)))
 
     def __call__(self, defects: npt.ArrayLike) -> Floats:
@@ -218,7 +224,7 @@ class Ghosts:
         shown: Sequence[Path],
         states: Floats,
         colors: Colors,
-        ghosts: int,
+        ghosts: int | None,
         camera: str | int | None,
     ) -> None:
         self.model, self.path, self.colors = model, shown[0], colors
@@ -230,11 +236,9 @@ class Ghosts:
         )
         scattered = self.path.x[0, self.knots, : model.nq].astype(float)
         self.seen = np.concatenate([self.qpos, scattered])
-        view_of(model, self.seen, self.camera, 1.0)  # complain now
         body = travelling_body(model)
         self.shown = [] if body is None else list(shown)
         self.places = [places(model, body, p.x[:, :, : model.nq]) for p in self.shown if body]
-        self.width = 0.004 * float(model.stat.extent)
 
     @contextmanager
     def opened(
@@ -264,8 +268,8 @@ class Ghosts:
             i, j, part = _moment(path, other, at)
             line = (1.0 - part) * points[i] + part * points[j]
             colors = self.colors(_blend(other.defects, i, j, part)[1:])
-            colors[:, 3] = 1.0 if rank == 0 else 0.3
-            stage.add_line(line, colors, self.width * (1.0 if rank == 0 else 0.5))
+            colors[:, 3] = 1.0 if rank == 0 else 0.45
+            stage.add_line(line, colors, 3.0 if rank == 0 else 1.2)
         colors = self.colors(_blend(path.defects, before, after, share))
         for k in np.asarray(knots):
             one, other_pose = (path.x[i, k, :nq].astype(float) for i in (before, after))
@@ -295,7 +299,9 @@ class Drawing:
         shown: Sequence[Path],
         states: Floats,
         colors: Colors,
+        left: float,
     ) -> None:
+        self.left = left  # share of the width that is left to the caption
         self.draw, self.states, self.shown, self.colors = draw, states, shown, colors
         self.start = np.asarray(solution.problem.x_init, float)
         self.times = solution.problem.times[: len(states)]
@@ -309,9 +315,11 @@ class Drawing:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import LineCollection
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         dpi = height / 5.0
-        figure = Figure(((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout="constrained")
+        layout = ConstrainedLayoutEngine(rect=(self.left, 0.0, 1.0 - self.left, 1.0))
+        figure = Figure(((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout=layout)
         canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
         path, drawn = self.shown[0], -1
         ways = [
@@ -385,13 +393,18 @@ class Strip:
         figure = Figure(
             ((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout="constrained", facecolor=_PAPER
         )
-        curves = [("cost", path.cost), ("max|h|", path.max_defect)]
+        first = np.diff(path.attempt, prepend=path.attempt[0]) > 0
+        starts = path.iteration[first]
+        last = np.append(first[1:], False)  # left out of curves, which break there
+        curves = [("cost", path.cost), ("max|h|", np.maximum(path.max_defect, _EXACT))]
         if path.sigma.any():
             curves.append(("noise sigma", np.where(path.sigma > 0, path.sigma, np.nan)))
         panels = np.atleast_1d(figure.subplots(1, len(curves)))
         self._iterations = path.iteration.astype(float)
         for axes, (title, values) in zip(panels, curves, strict=True):
-            _curve(axes, self._iterations, values, title)
+            _curve(axes, self._iterations, np.where(last, np.nan, values), title)
+            for start in starts:
+                axes.axvline(start, color="#5a6270", lw=0.8, ls=":")
         _scale(panels[1], colors)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
@@ -427,7 +440,7 @@ def _curve(axes: Axes, iterations: Floats, values: Floats, title: str) -> None:
     values = np.where(np.isfinite(values), values, np.nan)
     axes.set_facecolor(_PAPER)
     axes.plot(iterations, values, color=_LINE, lw=1.6)
-    if np.nanmin(values, initial=np.inf) > 0.0:
+    if np.min(values[np.isfinite(values)], initial=np.inf) > 0.0:
         axes.set_yscale("log")
     axes.set_xlim(0.0, max(1.0, iterations[-1]))
     axes.set_title(title, color=_INK, fontsize=9, loc="left", pad=3, parse_math=False)

@@ -79,7 +79,7 @@ def plot_solution(
         panel(figure.add_subplot(grid[row, column:last]))
     color = BLACK if solution.certified else VERMILLION
     figure.suptitle(_title(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | None = None) -> Path:
@@ -133,10 +133,11 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
         fontsize=9,
         parse_math=False,
     )
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
-def _save(figure: Figure, path: str | os.PathLike[str]) -> Path:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Writes a figure as a PNG, its folder made if need be; or a DraxError."""
     target = Path(path).expanduser()
     if target.suffix.lower() != ".png":
         raise DraxError(f"a plot is written as .png, not {target.name!r}")
@@ -207,7 +208,7 @@ def _draw_ways(
             label=_name(i + 1, optimum),
         )
     axes.set_xlim(times[0], times[-1])
-    _label(axes, label, "time [s]", [])
+    label_panel(axes, label, "time [s]", [])
 
 
 @dataclass(frozen=True)
@@ -252,7 +253,7 @@ class Curves:
         rows = -(-len(handles) // 3)
         axes.set_ylim(low, high + 0.13 * rows * (high - low))  # the legend stands above the curves
         axes.set_xlim(times[0], times[-1])
-        _label(axes, self.title, "time [s]", handles, loc="upper left", ncols=3)
+        label_panel(axes, self.title, "time [s]", handles, loc="upper left", ncols=3)
         axes.set_title(f"plan dashed, replay ({mode}) solid", loc="right", fontsize=7, color=GRAY)
 
 
@@ -355,7 +356,7 @@ def _draw_defects(axes: Axes, solution: Solution) -> None:
     label = f"feasible: below {FEASIBLE:g}"
     handles.append(axes.axhline(FEASIBLE, ls=":", lw=1.2, color=BLACK, label=label))
     axes.set_yscale("log")
-    _label(axes, "max|h| of all chains", "iteration", handles)
+    label_panel(axes, "max|h| of all chains", "iteration", handles)
 
 
 def _draw_costs(axes: Axes, solution: Solution) -> None:
@@ -363,7 +364,7 @@ def _draw_costs(axes: Axes, solution: Solution) -> None:
     handles = _draw_history(axes, solution, solution.history["cost"], feasible, VERMILLION)
     _scale_costs(axes, solution.history["cost"][feasible])
     nothing = "" if feasible.any() else ": there are none"
-    _label(axes, f"cost of feasible chains{nothing}", "iteration", handles)
+    label_panel(axes, f"cost of feasible chains{nothing}", "iteration", handles)
 
 
 def _draw_chains(axes: Axes, solution: Solution) -> None:
@@ -392,7 +393,7 @@ def _draw_chains(axes: Axes, solution: Solution) -> None:
     )
     _scale_costs(axes, cost)
     axes.set_xlim(0, len(cost) + 1)
-    _label(axes, "final cost of every chain", "chains in order of cost", handles)
+    label_panel(axes, "final cost of every chain", "chains in order of cost", handles)
 
 
 def _scale_costs(axes: Axes, costs: np.ndarray) -> None:
@@ -413,7 +414,7 @@ def _scale_costs(axes: Axes, costs: np.ndarray) -> None:
     axes.ticklabel_format(axis="y", useOffset=False)
 
 
-def _label(
+def label_panel(
     axes: Axes, title: str, xlabel: str, handles: Sequence[Artist], **legend_style: Any
 ) -> None:
     """What every panel has."""

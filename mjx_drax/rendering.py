@@ -35,6 +35,7 @@ from mjx_drax.movie import Frame
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from mjx_drax.problem import Problem
     from mjx_drax.solution import Solution
 
 Floats = npt.NDArray[np.floating[Any]]
@@ -103,12 +104,39 @@ def render(
             speed=speed,
         )
     if draw is None:
-        raise DraxError(
-            f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
-            "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
-        )
+        raise DraxError(_no_model(problem))
     frames = _drawn_frames(draw, states, frame_times(times, fps, speed), times, overlay, size)
     return movie.write(path, frames, fps, size)
+
+
+def check(
+    problem: Problem,
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+    draw: Callable[[Axes, np.ndarray], None] | None = None,
+) -> None:
+    """Complain before a solve about what `render` would refuse after it.
+
+    Raises:
+      DraxError: a size, fps, speed or camera that cannot be used, or neither a model nor `draw`.
+    """
+    frame_times(np.zeros(1), fps, speed)
+    movie.even(size)
+    model = getattr(problem.dynamics, "mj_model", None)
+    if model is not None:
+        view_of(model, model.qpos0[None], camera, 1.0)
+    elif draw is None:
+        raise DraxError(_no_model(problem))
+
+
+def _no_model(problem: Problem) -> str:
+    return (
+        f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
+        "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
+    )
 
 
 def outcome_lines(solution: Solution) -> list[str]:

@@ -72,6 +72,7 @@ def test_attempts_share_one_compilation():
     before = restarts._advance._cache_size()
     found = run(PROGRAM, 8, 0, Restarts(SHORT, attempts=3, enough=2.0))
     assert found.records[-1][0] == 120 + 2 * 60
+    assert found.began == [(0, 0), (120, 160), (180, 220)]  # the first has no noise
     assert restarts._advance._cache_size() - before == 1
 
 
