@@ -100,6 +100,7 @@ def render_diffusion(
     shown = [recording.path(chain) for chain in _chains(solution, chains)]
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
+    movie.film_path(path)
     height, width = movie.even(size)
     below = 2 * round(_STRIP * height / 2)
     states = solution.replayed[0]
@@ -231,9 +232,9 @@ class Ghosts:
         self.camera = FREE if camera is None else camera
         self.qpos, self.times = states[:, : model.nq], solution.problem.times[: len(states)]
         horizon = self.path.x.shape[1]
-        self.knots = np.unique(
-            np.linspace(horizon - 1, 0, min(ghosts, horizon)).round().astype(int)
-        )
+        parts = np.count_nonzero(model.body_weldid[model.geom_bodyid] != 0)
+        count = int(np.clip(_PARTS // max(parts, 1), *_COUNT) if ghosts is None else ghosts)
+        self.knots = np.linspace(0, horizon - 1, min(count, horizon)).round().astype(int)
         scattered = self.path.x[0, self.knots, : model.nq].astype(float)
         self.seen = np.concatenate([self.qpos, scattered])
         body = travelling_body(model)

@@ -134,14 +134,14 @@ class Recording:
 class Recorder:
     """Takes snapshots during a solve, every few iterations and whenever an attempt ends.
 
-    When they fill `limit` bytes, every second one is dropped and further ones are taken half as
+    When they fill `LIMIT` bytes, every second one is dropped and further ones are taken half as
     often; the first and the last of an attempt always stay.
     """
 
-    def __init__(self, every: int, limit: int = LIMIT) -> None:
+    def __init__(self, every: int) -> None:
         if not isinstance(every, int | np.integer) or every < 1:
             raise DraxError(f"record is {every!r}: give a whole number of iterations, at least 1.")
-        self.every, self.limit = int(every), limit
+        self.every = int(every)
         self.attempts: list[Tries] = []
 
     def begin(self, owners: np.ndarray) -> None:
@@ -162,7 +162,7 @@ class Recorder:
         )
         self.attempts[-1].snapshots.append(snapshot)
         taken = [shot for tries in self.attempts for shot in tries.snapshots]
-        if len(taken) > 4 and sum(shot.size for shot in taken) > self.limit:
+        if len(taken) > 4 and sum(shot.size for shot in taken) > LIMIT:
             self.every *= 2
             for tries in self.attempts:
                 shots = tries.snapshots
