@@ -169,7 +169,7 @@ def _caption(solution: Solution, path: Path, at: float) -> list[str]:
     """What is known at a position: the iteration that was last reached."""
     i = int(at)
     several = len(np.unique(path.attempt)) > 1
-    sigma = f"{path.sigma[i]:.2g}" if path.sigma[i] > 0.0 else "0: descent without noise"
+    sigma = f"{path.sigma[i]:.2g}" if path.sigma[i] > 0.0 else "0 (no noise)"
     return [
         solution.problem.name,
         f"iteration {path.iteration[i]}" + f", attempt {path.attempt[i] + 1}" * several,
@@ -232,7 +232,7 @@ class Ghosts:
         self.camera = FREE if camera is None else camera
         self.qpos, self.times = states[:, : model.nq], solution.problem.times[: len(states)]
         horizon = self.path.x.shape[1]
-        parts = np.count_nonzero(model.body_weldid[model.geom_bodyid] != 0)
+        parts = int(np.count_nonzero(model.body_weldid[model.geom_bodyid] != 0))
         count = int(np.clip(_PARTS // max(parts, 1), *_COUNT) if ghosts is None else ghosts)
         self.knots = np.linspace(0, horizon - 1, min(count, horizon)).round().astype(int)
         scattered = self.path.x[0, self.knots, : model.nq].astype(float)

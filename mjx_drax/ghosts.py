@@ -79,11 +79,11 @@ class Stage:
 
 def travelling_body(model: mujoco.MjModel) -> int | None:
     """The first body that moves in the plane or in space; its path is worth drawing."""
-    joints = mujoco.mjtJoint
+    free, slide = mujoco.mjtJoint.mjJNT_FREE.value, mujoco.mjtJoint.mjJNT_SLIDE.value
     for body in range(1, model.nbody):
         first = model.body_jntadr[body]
-        kinds = list(model.jnt_type[first : first + model.body_jntnum[body]])
-        if joints.mjJNT_FREE in kinds or kinds.count(joints.mjJNT_SLIDE) > 1:
+        kinds = [int(kind) for kind in model.jnt_type[first : first + model.body_jntnum[body]]]
+        if free in kinds or kinds.count(slide) > 1:
             return body
     return None
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,7 +114,9 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
         columns, size = min(3, len(panels)), (3.0, 3.2)
     else:
         shown = found[: len(CURVES)]
-        labels = [n for _, names in _state_labels(solution.problem.dynamics) for n in names]
+        groups = _state_groups(solution.problem.dynamics)
+        named = sorted(pair for _, names in groups for pair in names.items())
+        labels = [label for _, label in named]
         panels = [
             partial(_draw_ways, optima=shown, column=i, label=label, times=solution.problem.times)
             for i, label in enumerate(labels[:PANELS])
@@ -226,8 +229,8 @@ class Curves:
         """As few as hold no more curves than there are colors."""
         count = -(-len(self.labels) // len(CURVES))
         return [
-            Curves(self.title, self.labels[i::count], *(a[:, i::count] for a in self._arrays))
-            for i in range(count)
+            Curves(self.title, self.labels[i:j], *(a[:, i:j] for a in self._arrays))
+            for i, j in pairwise(round(k * len(self.labels) / count) for k in range(count + 1))
         ]
 
     @property
@@ -265,38 +268,45 @@ def _motion(solution: Solution) -> list[Curves]:
     lower, upper = (
         np.vstack([side.x[:1], side.x]).astype(float) for side in problem.bounds.sides(best)
     )
-    groups, start = [], 0
-    for title, labels in _state_labels(solution.problem.dynamics):
-        columns = slice(start, start + len(labels))
-        arrays = (a[:, columns] for a in (plan, states, lower, upper))
-        groups += Curves(title, labels, *arrays).parts()
-        start += len(labels)
+    groups = []
+    for title, names in _state_groups(solution.problem.dynamics):
+        arrays = (a[:, list(names)] for a in (plan, states, lower, upper))
+        groups += Curves(title, list(names.values()), *arrays).parts()
     limits = (np.asarray(side.u) for side in problem.bounds.sides(best))
     labels = _control_labels(problem.dynamics)
     return groups + Curves("controls", labels, np.asarray(best.u), controls, *limits).parts()
 
 
-def _state_labels(dynamics: Dynamics) -> list[tuple[str, list[str]]]:
-    """Titles of groups of states, with the names of their numbers."""
+def _state_groups(dynamics: Dynamics) -> list[tuple[str, dict[int, str]]]:
+    """Titles of groups of states, with the columns that belong to them and their names."""
     model = getattr(dynamics, "mj_model", None)
     if model is None:
-        return [("states", [f"x[{i}]" for i in range(dynamics.nx)])]
-    positions: list[str] = []
-    velocities: list[str] = []
+        return [("states", {i: f"x[{i}]" for i in range(dynamics.nx)})]
+    positions: dict[int, str] = {}
+    quaternions: dict[int, str] = {}
+    velocities: dict[int, str] = {}
     for j in range(model.njnt):
-        joint = model.joint(j)
-        name = joint.name or f"joint {j}"
-        unit = {2: "m", 3: "rad"}.get(int(model.jnt_type[j]), "")  # slide, hinge
-        for names, numbers, units in (
-            (positions, joint.qpos0, f" [{unit}]"),
-            (velocities, model.dof_jntid[model.dof_jntid == j], f" [{unit}/s]"),
-        ):
-            several = len(numbers) > 1
-            names += [f"{name}[{i}]" if several else name + units for i in range(len(numbers))]
-    groups = [("positions", positions), ("velocities", velocities)]
-    if model.na:
-        groups.append(("activations", [f"act[{i}]" for i in range(model.na)]))
-    return groups
+        name, kind = model.joint(j).name or f"joint {j}", int(model.jnt_type[j])
+        q, v = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
+        if kind in (2, 3):  # slide, hinge
+            unit = {2: "m", 3: "rad"}[kind]
+            positions[q], velocities[v] = f"{name} [{unit}]", f"{name} [{unit}/s]"
+            continue
+        if kind == 0:  # free: a place, then what a ball has
+            positions |= {q + i: f"{name} {axis} [m]" for i, axis in enumerate("xyz")}
+            velocities |= {v + i: f"{name} {axis} [m/s]" for i, axis in enumerate("xyz")}
+            q, v = q + 3, v + 3
+        quaternions |= {q + i: f"{name} q{part}" for i, part in enumerate("wxyz")}
+        velocities |= {v + i: f"{name} turn {axis} [rad/s]" for i, axis in enumerate("xyz")}
+    first = model.nq + model.nv
+    activations = {first + i: f"act[{i}]" for i in range(model.na)}
+    groups = {
+        "positions": positions,
+        "orientations": quaternions,
+        "velocities": velocities,
+        "activations": activations,
+    }
+    return [(title, names) for title, names in groups.items() if names]
 
 
 def _control_labels(dynamics: Dynamics) -> list[str]:

@@ -125,12 +125,12 @@ def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
         vmax=1.0,
     )
     axes.set_yticks(range(len(names)), names, fontsize=7, parse_math=False)
-    beside = axes.secondary_yaxis("right")
-    beside.set_yticks(range(len(names)), [f"{size:.2g}" for size in largest], fontsize=7)
-    beside.tick_params(length=0)
+    beside = axes.get_yaxis_transform()
+    for row, size in enumerate(largest):
+        axes.text(1.01, row, f"{size:.2g}", transform=beside, va="center", fontsize=7)
     axes.tick_params(labelsize=7)
     axes.set_xlabel("time [s]", fontsize=8)
-    bar = figure.colorbar(image, ax=axes, pad=0.02, ticks=[-1.0, 0.0, 1.0], aspect=25)
+    bar = figure.colorbar(image, ax=axes, pad=0.09, ticks=[-1.0, 0.0, 1.0], aspect=25)
     bar.ax.set_yticklabels(["-largest", "0", "largest"], fontsize=7)
     figure.suptitle(
         f"{solution.problem.name}: multipliers of the dynamics; at the right, each row's largest",
@@ -153,7 +153,7 @@ def coordinates(dynamics: Dynamics) -> list[Coordinate]:
     out: list[Coordinate] = []
     kinds = mujoco.mjtJoint
     for j in range(model.njnt):
-        name, kind = model.joint(j).name or f"joint {j}", model.jnt_type[j]
+        name, kind = model.joint(j).name or f"joint {j}", kinds(int(model.jnt_type[j]))
         if kind == kinds.mjJNT_FREE:
             out += [Coordinate(f"{name} {axis}", "m") for axis in "xyz"]
         if kind in (kinds.mjJNT_FREE, kinds.mjJNT_BALL):
@@ -184,7 +184,11 @@ def _phases(dynamics: Dynamics, states: Floats) -> tuple[Floats, Floats]:
     qpos = states[:, :nq]
     positions = np.array([between(model, qpos[0], q) for q in qpos])
     for j in range(model.njnt):  # from the model's zero, not from the first pose, where it can be
-        kind, q, v = model.jnt_type[j], model.jnt_qposadr[j], model.jnt_dofadr[j]
+        kind, q, v = (
+            mujoco.mjtJoint(int(model.jnt_type[j])),
+            model.jnt_qposadr[j],
+            model.jnt_dofadr[j],
+        )
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             positions[:, v : v + 3] = qpos[:, q : q + 3]
         elif kind != mujoco.mjtJoint.mjJNT_BALL:
