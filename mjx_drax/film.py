@@ -390,7 +390,7 @@ class Strip:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        dpi = width / 8.0
+        dpi = width / 7.0  # sets the size of letters
         figure = Figure(
             ((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout="constrained", facecolor=_PAPER
         )

@@ -94,19 +94,26 @@ def test_what_cannot_be_recorded() -> None:
             Recorder(every)  # type: ignore[arg-type]
 
 
-def test_film_of_a_model(cartpole: Solution, tmp_path: Path) -> None:
+@pytest.mark.parametrize("painted", [False, True])
+def test_film_of_a_model(
+    cartpole: Solution, painted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if painted:
+        monkeypatch.setattr(rendering, "_gl_context", lambda: None)
     path = film.render_diffusion(
-        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=10, size=(240, 320), ghosts=4
+        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(180, 240), ghosts=4
     )
     with Image.open(path) as image:
-        assert image.size == (320, 240)
+        assert image.size == (240, 180)
         # The scattered knots, their way, the end; then two tenths of a second, and it is held.
         frames = []
         for i in range(image.n_frames):  # type: ignore[attr-defined]
             image.seek(i)
             frames.append(np.asarray(image.convert("RGB"), int))
+    scene = frames[0][:130]
     difference = [np.abs(frame - frames[0]).mean() for frame in frames]
     assert difference[-1] > 2.0
+    assert (scene[..., 0] > scene[..., 2] + 90).sum() > 50  # ghosts that break the dynamics
     assert [item.name for item in path.parent.iterdir()] == ["film.webp"]
 
 
