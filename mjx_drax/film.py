@@ -279,10 +279,17 @@ class Ghosts:
 
 
 def _moment(path: Path, other: Path, at: float) -> tuple[int, int, float]:
-    """Where another chain is when one is at a position: at the same iteration, or at its end."""
+    """Where another chain is when one is at a position; at the one's end, at its own.
+
+    That is at the same iteration of the same attempt, or where its attempts ended before.
+    """
     i, j, share = _parts(at, len(path.iteration))
+    if i == len(path.iteration) - 1:
+        end = len(other.iteration) - 1
+        return end, end, 0.0
     iteration = (1.0 - share) * path.iteration[i] + share * path.iteration[j]
-    last = int(np.searchsorted(other.iteration, iteration, side="right")) - 1
+    past = (other.iteration <= iteration) & (other.attempt <= path.attempt[i])
+    last = int(np.flatnonzero(past)[-1])
     following = min(last + 1, len(other.iteration) - 1)
     gap = other.iteration[following] - other.iteration[last]
     if gap == 0 or other.attempt[following] != other.attempt[last]:

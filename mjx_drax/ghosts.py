@@ -89,13 +89,13 @@ def travelling_body(model: mujoco.MjModel) -> int | None:
 
 
 def places(model: mujoco.MjModel, body: int, qpos: Floats) -> Floats:
-    """Where a body is in poses (..., nq), (..., 3)."""
+    """Where a body's centre of mass is in poses (..., nq), (..., 3)."""
     data, flat = mujoco.MjData(model), qpos.reshape(-1, model.nq)
     out = np.empty((len(flat), 3))
     for place, pose in zip(out, flat, strict=True):
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
-        place[:] = data.xpos[body]
+        place[:] = data.xipos[body]
     return out.reshape(*qpos.shape[:-1], 3)
 
 

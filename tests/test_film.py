@@ -163,6 +163,31 @@ def test_film_time_is_spent_where_knots_move() -> None:
     assert np.median(at) < 5.0
 
 
+def _timeline(iteration: list[int], attempt: list[int]) -> recording.Path:
+    count = len(iteration)
+    numbers = np.ones(count)
+    return recording.Path(
+        iteration=np.array(iteration),
+        sigma=numbers,
+        cost=numbers,
+        max_defect=numbers,
+        attempt=np.array(attempt),
+        x=np.ones((count, 2, 1)),
+        defects=np.ones((count, 2)),
+    )
+
+
+def test_other_chains_are_shown_at_the_same_time() -> None:
+    one = _timeline([0, 2, 4, 4, 6], [0, 0, 0, 1, 1])
+    early, late = _timeline([0, 4], [0, 0]), _timeline([0, 4, 4, 8, 8, 12], [0, 0, 1, 1, 2, 2])
+    assert film._moment(one, late, 0.5) == (0, 1, 0.25)
+    assert film._moment(one, late, 2.0) == (1, 1, 0.0)  # its first attempt ends as well
+    assert film._moment(one, late, 3.0) == (2, 3, 0.0)  # the second begins
+    assert film._moment(one, late, 3.5) == (2, 3, 0.25)
+    assert film._moment(one, late, 4.0) == (5, 5, 0.0)  # its answer
+    assert film._moment(one, early, 3.5) == (1, 1, 0.0)
+
+
 def test_what_cannot_be_filmed(trapped: Solution, cartpole: Solution, tmp_path: Path) -> None:
     target = tmp_path / "film.mp4"
     bare = solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT)
