@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mjx_drax.derivatives import Autodiff as Autodiff
     from mjx_drax.derivatives import Smoothed as Smoothed
     from mjx_drax.errors import DraxError as DraxError
+    from mjx_drax.film import render_diffusion as render_diffusion
+    from mjx_drax.ghosts import render_timelapse as render_timelapse
     from mjx_drax.langevin import Langevin as Langevin
     from mjx_drax.mjcf import from_mjcf as from_mjcf
     from mjx_drax.precondition import Diagonal as Diagonal
@@ -61,6 +63,8 @@ _HOME = {
     "Trajectory": "problem",
     "from_function": "problem",
     "render": "rendering",
+    "render_diffusion": "film",
+    "render_timelapse": "ghosts",
     "Restarts": "restarts",
     "Constant": "schedules",
     "Geometric": "schedules",

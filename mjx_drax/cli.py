@@ -120,7 +120,29 @@ def _parser() -> argparse.ArgumentParser:
     solving.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
     solving.add_argument("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
     solving.add_argument("--out", metavar="DIR", help="default out/TASK")
-    solving.add_argument("--no-video", action="store_true", help="leave out video.mp4")
+    solving.add_argument(
+        "--no-video", action="store_true", help="leave out video.mp4 and timelapse.png"
+    )
+    solving.add_argument(
+        "--film",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help="also film how the knots condense into the motion: .mp4, .gif or .webp; "
+        "default DIR/film.mp4",
+    )
+    solving.add_argument(
+        "--camera",
+        metavar="NAME",
+        help="a camera of the model, or free: one that frames the whole motion",
+    )
+    solving.add_argument(
+        "--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]"
+    )
+    solving.add_argument("--fps", type=float, metavar="N", help="frames per second")
+    solving.add_argument(
+        "--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion"
+    )
     solving.set_defaults(run=_solve)
 
     measuring = commands.add_parser(
@@ -168,6 +190,14 @@ def _positive(text: str) -> int:
     return value
 
 
+def _size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT as (height, width)."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not like 640x480")
+    return int(height), int(width)
+
+
 def _list(options: argparse.Namespace) -> int:
     from mjx_drax import tasks
 
@@ -203,28 +233,77 @@ def _solve(options: argparse.Namespace) -> int:
     if options.iterations is not None:
         solver = with_iterations(solver, options.iterations)
     folder = results.writable(options.out or Path("out") / problem.name)
+    look = {n: getattr(options, n) for n in ("camera", "size", "fps", "speed")}
+    look = {name: value for name, value in look.items() if value is not None}
+    film = _film(options, folder, problem, draw, look)
     _cache_compilations()
 
     chains = options.chains or chains
     say(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
     with _Bar() as bar:
-        solution = solve(problem, chains, options.seed, solver, progress=bar)
+        solution = solve(
+            problem, chains, options.seed, solver, progress=bar, record=1 if film else None
+        )
     results.save(solution, folder)
+    written = ["result.json", "result.npz", *_pictures(solution, folder, draw)]
+    if not options.no_video:
+        written += _video(solution, folder, draw, look)
+    if film is not None:
+        from mjx_drax.film import render_diffusion
+
+        render_diffusion(solution, film, draw=draw, **look)
+    _report(solution)
+    say(f"written to {folder}/: {', '.join(written)}")
+    if film is not None:
+        say(f"film written to {film}")
+    return 0 if solution.certified else 1
+
+
+def _film(
+    options: argparse.Namespace, folder: Path, problem: Problem, draw: Any, look: dict[str, Any]
+) -> Path | None:
+    """Where the film goes, if one is asked for; what cannot be filmed is refused before solving."""
+    from mjx_drax import movie, rendering
+
+    if options.film is not None or look:
+        rendering.check(problem, draw=draw, **look)
+    return (
+        movie.film_path(options.film or folder / "film.mp4") if options.film is not None else None
+    )
+
+
+def _pictures(solution: Solution, folder: Path, draw: Any) -> list[str]:
+    """Plots of a solution; returns the files' names."""
     from mjx_drax.plotting import plot_optima, plot_solution
+    from mjx_drax.portraits import has_phases, plot_multipliers, plot_phase
 
     plot_solution(solution, folder / "plot.png", draw=draw)
-    written = ["result.json", "result.npz", "plot.png"]
+    plot_multipliers(solution, folder / "multipliers.png")
+    written = ["plot.png", "multipliers.png"]
+    if has_phases(solution.problem.dynamics):
+        plot_phase(solution, folder / "phase.png")
+        written.append("phase.png")
     if len(solution.optima) > 1:
         plot_optima(solution, folder / "optima.png", draw=draw)
         written.append("optima.png")
-    if not options.no_video and (draw is not None or hasattr(problem.dynamics, "mj_model")):
-        from mjx_drax.rendering import render
+    return written
 
-        render(solution, folder / "video.mp4", draw=draw)
-        written.append("video.mp4")
-    _report(solution)
-    say(f"written to {folder}/: {', '.join(written)}")
-    return 0 if solution.certified else 1
+
+def _video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any]) -> list[str]:
+    """The motion as a video, and in one picture; returns the files' names."""
+    from mjx_drax.rendering import render
+
+    has_model = hasattr(solution.problem.dynamics, "mj_model")
+    if not has_model and draw is None:
+        return []
+    render(solution, folder / "video.mp4", draw=draw, **look)
+    if not has_model:
+        return ["video.mp4"]
+    from mjx_drax.ghosts import render_timelapse
+
+    still = {name: look[name] for name in ("camera", "size") if name in look}
+    render_timelapse(solution, folder / "timelapse.png", **still)
+    return ["video.mp4", "timelapse.png"]
 
 
 def _benchmark(options: argparse.Namespace) -> int:

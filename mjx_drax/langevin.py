@@ -193,6 +193,12 @@ class Langevin:
                 "adjustment needs a vector space."
             )
 
+    def sigma(self, iteration: int) -> float:
+        """The noise that an iteration, from 0, adds; 0 in the tail."""
+        if iteration >= self.iterations:
+            return 0.0
+        return float(self.levels(iteration / max(self.iterations - 1, 1)).noise)
+
     def levels(self, t: ArrayLike) -> Levels:
         """The schedules' values at progress t in [0, 2]."""
         t = jnp.asarray(t)

@@ -195,8 +195,10 @@ class Painter:
         if geom.type == _GEOM.mjGEOM_CYLINDER:
             return _scaled(_prism(24), (x, y, z))
         if geom.type in (_GEOM.mjGEOM_LINE, _GEOM.mjGEOM_ARROW, _GEOM.mjGEOM_ARROW1):
-            # MuJoCo's connectors run from their position along z, over the length in size[2].
-            half = max(x, 1e-3)
+            # MuJoCo's connectors run from their position along z, over the length in size[2]; the
+            # width of lines is in pixels.
+            line = geom.type == _GEOM.mjGEOM_LINE
+            half = 1e-3 * self._model.stat.extent * x if line else max(x, 1e-3)
             return _shifted(_scaled(_prism(8), (half, half, z / 2.0)), z / 2.0)
         if geom.type == _GEOM.mjGEOM_BOX:
             return _scaled(_box(), (x, y, z))

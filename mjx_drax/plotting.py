@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,7 +80,7 @@ def plot_solution(
         panel(figure.add_subplot(grid[row, column:last]))
     color = BLACK if solution.certified else VERMILLION
     figure.suptitle(_title(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | None = None) -> Path:
@@ -113,7 +114,9 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
         columns, size = min(3, len(panels)), (3.0, 3.2)
     else:
         shown = found[: len(CURVES)]
-        labels = [n for _, names in _state_labels(solution.problem.dynamics) for n in names]
+        groups = _state_groups(solution.problem.dynamics)
+        named = sorted(pair for _, names in groups for pair in names.items())
+        labels = [label for _, label in named]
         panels = [
             partial(_draw_ways, optima=shown, column=i, label=label, times=solution.problem.times)
             for i, label in enumerate(labels[:PANELS])
@@ -133,10 +136,11 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
         fontsize=9,
         parse_math=False,
     )
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
-def _save(figure: Figure, path: str | os.PathLike[str]) -> Path:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Writes a figure as a PNG, its folder made if need be; or a DraxError."""
     target = Path(path).expanduser()
     if target.suffix.lower() != ".png":
         raise DraxError(f"a plot is written as .png, not {target.name!r}")
@@ -207,7 +211,7 @@ def _draw_ways(
             label=_name(i + 1, optimum),
         )
     axes.set_xlim(times[0], times[-1])
-    _label(axes, label, "time [s]", [])
+    label_panel(axes, label, "time [s]", [])
 
 
 @dataclass(frozen=True)
@@ -225,8 +229,8 @@ class Curves:
         """As few as hold no more curves than there are colors."""
         count = -(-len(self.labels) // len(CURVES))
         return [
-            Curves(self.title, self.labels[i::count], *(a[:, i::count] for a in self._arrays))
-            for i in range(count)
+            Curves(self.title, self.labels[i:j], *(a[:, i:j] for a in self._arrays))
+            for i, j in pairwise(round(k * len(self.labels) / count) for k in range(count + 1))
         ]
 
     @property
@@ -252,7 +256,7 @@ class Curves:
         rows = -(-len(handles) // 3)
         axes.set_ylim(low, high + 0.13 * rows * (high - low))  # the legend stands above the curves
         axes.set_xlim(times[0], times[-1])
-        _label(axes, self.title, "time [s]", handles, loc="upper left", ncols=3)
+        label_panel(axes, self.title, "time [s]", handles, loc="upper left", ncols=3)
         axes.set_title(f"plan dashed, replay ({mode}) solid", loc="right", fontsize=7, color=GRAY)
 
 
@@ -264,38 +268,45 @@ def _motion(solution: Solution) -> list[Curves]:
     lower, upper = (
         np.vstack([side.x[:1], side.x]).astype(float) for side in problem.bounds.sides(best)
     )
-    groups, start = [], 0
-    for title, labels in _state_labels(solution.problem.dynamics):
-        columns = slice(start, start + len(labels))
-        arrays = (a[:, columns] for a in (plan, states, lower, upper))
-        groups += Curves(title, labels, *arrays).parts()
-        start += len(labels)
+    groups = []
+    for title, names in _state_groups(solution.problem.dynamics):
+        arrays = (a[:, list(names)] for a in (plan, states, lower, upper))
+        groups += Curves(title, list(names.values()), *arrays).parts()
     limits = (np.asarray(side.u) for side in problem.bounds.sides(best))
     labels = _control_labels(problem.dynamics)
     return groups + Curves("controls", labels, np.asarray(best.u), controls, *limits).parts()
 
 
-def _state_labels(dynamics: Dynamics) -> list[tuple[str, list[str]]]:
-    """Titles of groups of states, with the names of their numbers."""
+def _state_groups(dynamics: Dynamics) -> list[tuple[str, dict[int, str]]]:
+    """Titles of groups of states, with the columns that belong to them and their names."""
     model = getattr(dynamics, "mj_model", None)
     if model is None:
-        return [("states", [f"x[{i}]" for i in range(dynamics.nx)])]
-    positions: list[str] = []
-    velocities: list[str] = []
+        return [("states", {i: f"x[{i}]" for i in range(dynamics.nx)})]
+    positions: dict[int, str] = {}
+    quaternions: dict[int, str] = {}
+    velocities: dict[int, str] = {}
     for j in range(model.njnt):
-        joint = model.joint(j)
-        name = joint.name or f"joint {j}"
-        unit = {2: "m", 3: "rad"}.get(int(model.jnt_type[j]), "")  # slide, hinge
-        for names, numbers, units in (
-            (positions, joint.qpos0, f" [{unit}]"),
-            (velocities, model.dof_jntid[model.dof_jntid == j], f" [{unit}/s]"),
-        ):
-            several = len(numbers) > 1
-            names += [f"{name}[{i}]" if several else name + units for i in range(len(numbers))]
-    groups = [("positions", positions), ("velocities", velocities)]
-    if model.na:
-        groups.append(("activations", [f"act[{i}]" for i in range(model.na)]))
-    return groups
+        name, kind = model.joint(j).name or f"joint {j}", int(model.jnt_type[j])
+        q, v = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
+        if kind in (2, 3):  # slide, hinge
+            unit = {2: "m", 3: "rad"}[kind]
+            positions[q], velocities[v] = f"{name} [{unit}]", f"{name} [{unit}/s]"
+            continue
+        if kind == 0:  # free: a place, then what a ball has
+            positions |= {q + i: f"{name} {axis} [m]" for i, axis in enumerate("xyz")}
+            velocities |= {v + i: f"{name} {axis} [m/s]" for i, axis in enumerate("xyz")}
+            q, v = q + 3, v + 3
+        quaternions |= {q + i: f"{name} q{part}" for i, part in enumerate("wxyz")}
+        velocities |= {v + i: f"{name} turn {axis} [rad/s]" for i, axis in enumerate("xyz")}
+    first = model.nq + model.nv
+    activations = {first + i: f"act[{i}]" for i in range(model.na)}
+    groups = {
+        "positions": positions,
+        "orientations": quaternions,
+        "velocities": velocities,
+        "activations": activations,
+    }
+    return [(title, names) for title, names in groups.items() if names]
 
 
 def _control_labels(dynamics: Dynamics) -> list[str]:
@@ -335,12 +346,16 @@ def _draw_history(
     band.set_label("smallest to largest")
     handles: list[Artist] = [*axes.plot(iterations, median, ".-", ms=3, lw=1.6, color=color)]
     handles[0].set_label("median")
-    marks = [mark for mark in solution.solver.noise_ends if 0 < mark <= iterations[-1]]
-    for mark in marks:
-        line = axes.axvline(mark, ls="--", lw=1, color=GRAY)
-    if marks:
-        line.set_label("noise ends")
-        handles.append(line)
+    began, ended = solution.history["began"], solution.history["noise_ends"]
+    for marks, dash, label in (
+        (began[1:], "-", "next attempt"),
+        (ended[ended > began], "--", "noise ends"),
+    ):
+        for mark in marks:
+            line = axes.axvline(mark, ls=dash, lw=1, color=GRAY, zorder=1)
+        if len(marks):
+            line.set_label(label)
+            handles.append(line)
     axes.set_xlim(0, max(1, iterations[-1]))
     return [*handles, band]
 
@@ -351,7 +366,7 @@ def _draw_defects(axes: Axes, solution: Solution) -> None:
     label = f"feasible: below {FEASIBLE:g}"
     handles.append(axes.axhline(FEASIBLE, ls=":", lw=1.2, color=BLACK, label=label))
     axes.set_yscale("log")
-    _label(axes, "max|h| of all chains", "iteration", handles)
+    label_panel(axes, "max|h| of all chains", "iteration", handles)
 
 
 def _draw_costs(axes: Axes, solution: Solution) -> None:
@@ -359,7 +374,7 @@ def _draw_costs(axes: Axes, solution: Solution) -> None:
     handles = _draw_history(axes, solution, solution.history["cost"], feasible, VERMILLION)
     _scale_costs(axes, solution.history["cost"][feasible])
     nothing = "" if feasible.any() else ": there are none"
-    _label(axes, f"cost of feasible chains{nothing}", "iteration", handles)
+    label_panel(axes, f"cost of feasible chains{nothing}", "iteration", handles)
 
 
 def _draw_chains(axes: Axes, solution: Solution) -> None:
@@ -388,7 +403,7 @@ def _draw_chains(axes: Axes, solution: Solution) -> None:
     )
     _scale_costs(axes, cost)
     axes.set_xlim(0, len(cost) + 1)
-    _label(axes, "final cost of every chain", "chains in order of cost", handles)
+    label_panel(axes, "final cost of every chain", "chains in order of cost", handles)
 
 
 def _scale_costs(axes: Axes, costs: np.ndarray) -> None:
@@ -409,7 +424,7 @@ def _scale_costs(axes: Axes, costs: np.ndarray) -> None:
     axes.ticklabel_format(axis="y", useOffset=False)
 
 
-def _label(
+def label_panel(
     axes: Axes, title: str, xlabel: str, handles: Sequence[Artist], **legend_style: Any
 ) -> None:
     """What every panel has."""

@@ -26,23 +26,26 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from mjx_drax import movie
 from mjx_drax._mujoco import APT_EGL, mujoco
 from mjx_drax.errors import DraxError
 from mjx_drax.host import interpolated
+from mjx_drax.movie import Frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from PIL import ImageFont
 
+    from mjx_drax.problem import Problem
     from mjx_drax.solution import Solution
 
-Frame = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.floating[Any]]
 
+FREE = "free"
+"""The camera that frames the whole motion by itself."""
+
+_MARGIN = 1.1  # of the free camera's distance
 _HOLD = 0.5  # [s] the last frame stays this long
 _DRAWN_INCHES = 5.0  # height of a drawn frame: sets the size of its letters
-_UNCERTIFIED = "NOT CERTIFIED"  # these words in an overlay turn its box red
-_CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
 _GL_OFF = ("off", "0", "false", "disable", "disabled")
 
 
@@ -60,6 +63,7 @@ def render(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
+    speed: float = 1.0,
     draw: Callable[[Axes, np.ndarray], None] | None = None,
 ) -> Path:
     """Films the best chain's motion as it was replayed, not as it was planned; returns the path.
@@ -69,36 +73,73 @@ def render(
 
     Args:
       solution: from `solve`.
-      path: where to, ending in .mp4; its folder is made if need be.
+      path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       fps: frames per second.
       size: (height, width) [pixels].
       camera: a camera of the model, see `render_frames`.
+      speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
         for problems without a model (others do not use it).
 
     Raises:
-      DraxError: a path, size, fps or camera that cannot be used, or neither a model nor `draw`.
+      DraxError: a path, size, fps, speed or camera that cannot be used, or neither a model nor
+        `draw`.
     """
     problem = solution.problem
     model = getattr(problem.dynamics, "mj_model", None)
     states = solution.replayed[0]
     shown = int(np.cumprod(np.isfinite(states).all(axis=1)).sum())
-    states, times, overlay = states[:shown], problem.times[:shown], _overlay(solution)
+    states, times, overlay = states[:shown], problem.times[:shown], outcome_lines(solution)
     if model is not None:
         qpos = states[:, : model.nq]
         return render_motion(
-            model, qpos, times, path, overlay=overlay, fps=fps, size=size, camera=camera
+            model,
+            qpos,
+            times,
+            path,
+            overlay=overlay,
+            fps=fps,
+            size=size,
+            camera=camera,
+            speed=speed,
         )
     if draw is None:
-        raise DraxError(
-            f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
-            "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
-        )
-    frames = _drawn_frames(draw, states, _instants(times, fps), times, overlay, size)
-    return _write_video(path, frames, fps, size)
+        raise DraxError(_no_model(problem))
+    frames = _drawn_frames(draw, states, frame_times(times, fps, speed), times, overlay, size)
+    return movie.write(path, frames, fps, size)
 
 
-def _overlay(solution: Solution) -> list[str]:
+def check(
+    problem: Problem,
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+    draw: Callable[[Axes, np.ndarray], None] | None = None,
+) -> None:
+    """Complain before a solve about what `render` would refuse after it.
+
+    Raises:
+      DraxError: a size, fps, speed or camera that cannot be used, or neither a model nor `draw`.
+    """
+    frame_times(np.zeros(1), fps, speed)
+    movie.even(size)
+    model = getattr(problem.dynamics, "mj_model", None)
+    if model is not None:
+        view_of(model, model.qpos0[None], camera, 1.0)
+    elif draw is None:
+        raise DraxError(_no_model(problem))
+
+
+def _no_model(problem: Problem) -> str:
+    return (
+        f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
+        "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
+    )
+
+
+def outcome_lines(solution: Solution) -> list[str]:
     """Lines of text for a film, short ones, which leave the robot in view."""
     chain, mode = solution.best_chain, solution.replay_mode
     cost, defect, violation = (
@@ -116,7 +157,7 @@ def _overlay(solution: Solution) -> list[str]:
     if not solution.certified:
         breach = "the plan breaks the dynamics"
         reason = "no replay succeeds" if solution.feasible[chain] else breach
-        lines.insert(1, f"{_UNCERTIFIED}: {reason}")
+        lines.insert(1, f"{movie.UNCERTIFIED}: {reason}")
     return lines
 
 
@@ -130,45 +171,15 @@ def render_motion(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
+    speed: float = 1.0,
 ) -> Path:
-    """Writes a motion as an H.264 mp4 that browsers play, and returns its path.
+    """Films a motion as an H.264 mp4 that browsers play, or as .gif or .webp; returns the path.
 
-    The arguments are those of `render_frames`; `path` ends in .mp4, and its folder is made if
-    need be. The file appears once it is complete. Raises DraxError before anything is drawn.
+    The arguments are those of `render_frames`; the path's folder is made if need be. The file
+    appears once it is complete. Raises DraxError before anything is drawn.
     """
-    frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
-    return _write_video(path, frames, fps, size)
-
-
-def _write_video(
-    path: str | os.PathLike[str],
-    frames: Generator[Frame, None, None],
-    fps: float,
-    size: tuple[int, int],
-) -> Path:
-    """Writes frames of a size, rounded up to even, as an H.264 mp4 that browsers play."""
-    target = _video_path(path)
-    partial = target.with_name(f".{target.stem}.partial.mp4")
-    try:
-        partial.touch()
-    except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
-
-    import imageio_ffmpeg
-    import mediapy
-
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())  # so that pip alone is enough
-    try:
-        with mediapy.VideoWriter(
-            partial, _even(size), fps=fps, crf=_CRF, ffmpeg_args=("-movflags", "+faststart")
-        ) as writer:
-            for frame in frames:
-                writer.add_image(frame)
-        partial.replace(target)
-    finally:
-        frames.close()
-        partial.unlink(missing_ok=True)
-    return target
+    frames = _frames(model, qpos, times, overlay, fps, size, camera, speed)
+    return movie.write(path, frames, fps, size)
 
 
 def render_frames(
@@ -180,6 +191,7 @@ def render_frames(
     fps: float = 30.0,
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
+    speed: float = 1.0,
 ) -> Frame:
     """Frames (N, height, width, 3) uint8 of a motion, the last one held for half a second.
 
@@ -190,13 +202,14 @@ def render_frames(
       overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
       fps: frames per second.
       size: (height, width) [pixels]; odd ones are made even, which players ask for.
-      camera: a camera's name or index; None takes the one called "main", or, in a model without
-        one, a free camera that frames the whole motion.
+      camera: a camera's name or index; "free" is one that frames the whole motion by itself. None
+        takes the one called "main", or, in a model without one, the free one.
+      speed: of the motion; 0.5 is slow motion.
 
     Raises:
       DraxError: positions of the wrong shape or not finite, decreasing times, unknown camera.
     """
-    frames = _frames(model, qpos, times, overlay=overlay, fps=fps, size=size, camera=camera)
+    frames = _frames(model, qpos, times, overlay, fps, size, camera, speed)
     return np.stack(list(frames))
 
 
@@ -204,30 +217,30 @@ def _frames(
     model: mujoco.MjModel,
     qpos: npt.ArrayLike,
     times: npt.ArrayLike,
-    *,
     overlay: Sequence[str],
     fps: float,
     size: tuple[int, int],
     camera: str | int | None,
+    speed: float,
 ) -> Generator[Frame, None, None]:
     """Checks everything now, draws one frame at a time later."""
     positions, instants = _checked_motion(model, qpos, times)
-    at = _instants(instants, fps)
+    at = frame_times(instants, fps, speed)
     if isinstance(overlay, str):
         raise DraxError(f"overlay is a sequence of lines, not one string: [{overlay!r}]")
-    height, width = _even(size)
-    view = _camera(model, positions, camera, width / height)
+    height, width = movie.even(size)
+    view = view_of(model, positions, camera, width / height)
 
     def draw() -> Generator[Frame, None, None]:
         data = mujoco.MjData(model)
         scene = mujoco.MjvScene(model, maxgeom=10_000)
         option = mujoco.MjvOption()
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        with _drawer(model, height, width) as drawer:
+        with open_drawer(model, height, width) as drawer:
             for time in at:
-                _pose(model, data, interpolated(model, positions, instants, time))
+                set_pose(model, data, interpolated(model, positions, instants, time))
                 mujoco.mjv_updateScene(model, data, option, None, view, everything, scene)
-                yield _write(drawer.render(scene), overlay, time)
+                yield movie.captioned(drawer.render(scene), overlay, time)
 
     return draw()
 
@@ -241,7 +254,7 @@ def _drawn_frames(
     size: tuple[int, int],
 ) -> Generator[Frame, None, None]:
     """Frames at some instants of states (T, nx), drawn anew at each knot, below the overlay."""
-    height, width = _even(size)
+    height, width = movie.even(size)
 
     def frames() -> Generator[Frame, None, None]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -249,7 +262,7 @@ def _drawn_frames(
         from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         dpi = height / _DRAWN_INCHES
-        top = 1.0 - _text_box(overlay, height, width)[1][3] / height
+        top = 1.0 - movie.text_box(overlay, height, width)[1][3] / height
         layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, top))
         figure = Figure(((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, layout=layout)
         canvas = FigureCanvasAgg(figure)
@@ -261,17 +274,19 @@ def _drawn_frames(
                 draw(figure.add_subplot(), states[: knot + 1])
                 canvas.draw()
                 drawn, picture = knot, np.array(canvas.buffer_rgba())[..., :3]
-            yield _write(picture, overlay, time)
+            yield movie.captioned(picture, overlay, time)
 
     return frames()
 
 
-def _instants(times: Floats, fps: float) -> Floats:
+def frame_times(times: Floats, fps: float, speed: float = 1.0) -> Floats:
     """When frames are taken of a motion between times (T,) [s]: its end is held."""
-    if not (np.isfinite(fps) and fps > 0.0):
-        raise DraxError(f"fps must be positive, not {fps}")
-    count = int((times[-1] - times[0]) * fps + 1e-6) + 1
-    at = times[0] + np.arange(count) / fps
+    for name, value in (("fps", fps), ("speed", speed)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise DraxError(f"{name} must be positive, not {value}")
+    step = speed / fps
+    count = int((times[-1] - times[0]) / step + 1e-6) + 1
+    at = times[0] + np.arange(count) * step
     return np.append(at, np.full(round(_HOLD * fps), times[-1]))
 
 
@@ -293,28 +308,7 @@ def _checked_motion(
     return positions, instants
 
 
-def _even(size: tuple[int, int]) -> tuple[int, int]:
-    """The size, rounded up to even numbers: yuv420p halves both sides."""
-    height, width = (int(side) for side in size)
-    if not (16 <= height <= 8192 and 16 <= width <= 8192):
-        raise DraxError(f"size (height, width) must lie within 16 and 8192 pixels, not {size}")
-    return height + height % 2, width + width % 2
-
-
-def _video_path(path: str | os.PathLike[str]) -> Path:
-    target = Path(path).expanduser()
-    if target.suffix.lower() != ".mp4":
-        raise DraxError(f"a video is written as .mp4, not {target.name!r}")
-    if target.is_dir():
-        raise DraxError(f"cannot write {target}: it is a folder")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
-    return target
-
-
-def _pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
+def set_pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
     """Sets the position and computes what a scene shows; no collisions, no forces."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -326,18 +320,19 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
 # Cameras
 
 
-def _camera(
+def view_of(
     model: mujoco.MjModel, qpos: Floats, wanted: str | int | None, aspect: float
 ) -> mujoco.MjvCamera:
+    """The camera asked for, as in `render_frames`, for a motion qpos (T, nq)."""
     names = [model.camera(index).name for index in range(model.ncam)]
     if wanted is None:
-        if "main" not in names:
-            return _framing_camera(model, qpos, aspect)
-        wanted = "main"
+        wanted = "main" if "main" in names else FREE
+    if wanted == FREE and FREE not in names:
+        return _framing_camera(model, qpos, aspect)
     index = names.index(wanted) if wanted in names else wanted
     if isinstance(index, str) or not 0 <= index < model.ncam:
         known = ", ".join(name or f"{i} (unnamed)" for i, name in enumerate(names)) or "none"
-        raise DraxError(f"no camera {wanted!r} in this model; its cameras: {known}")
+        raise DraxError(f"no camera {wanted!r} in this model: use {FREE!r}, or of its own: {known}")
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FIXED
     view.fixedcamid = index
@@ -345,102 +340,61 @@ def _camera(
 
 
 def _framing_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoco.MjvCamera:
-    """A free camera that sees every moving geom in every pose of the motion."""
+    """A free camera that sees every moving geom in every pose of the motion.
+
+    It looks the way the camera called "main" does at first, if there is one.
+    """
     data = mujoco.MjData(model)
     sized = model.geom_rbound > 0.0  # planes have none
     moving = sized & (model.body_weldid[model.geom_bodyid] != 0)
     chosen = moving if np.any(moving) else sized
-    poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, 60).astype(int))]
+    poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, 240).astype(int))]
     places = np.empty((len(poses), int(chosen.sum()), 3))
     for place, pose in zip(places, poses, strict=True):
-        _pose(model, data, pose)
+        set_pose(model, data, pose)
         place[:] = data.geom_xpos[chosen]
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FREE
-    view.azimuth, view.elevation = 110.0, -12.0
-    radius = float(model.stat.extent)
-    view.lookat[:] = model.stat.center
+    view.azimuth, view.elevation = _direction(model)
+    center, bound = model.stat.center, np.array([model.stat.extent])
     if places.size:
-        bound = model.geom_rbound[chosen][:, None]
-        center = ((places - bound).min(axis=(0, 1)) + (places + bound).max(axis=(0, 1))) / 2.0
-        radius = float((np.linalg.norm(places - center, axis=-1) + bound[:, 0]).max())
-        view.lookat[:] = center
-    half_angle = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * min(1.0, aspect))
-    view.distance = 1.05 * radius / np.sin(half_angle)
+        center = (places.min(axis=(0, 1)) + places.max(axis=(0, 1))) / 2.0
+        bound = np.tile(model.geom_rbound[chosen], len(places))
+    azimuth, elevation = np.radians([view.azimuth, view.elevation])
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    ahead = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([flat[1], -flat[0], 0.0])
+    axes = np.array([right, np.cross(right, ahead), ahead])
+    across, up, depth = axes @ (places.reshape(-1, 3) - center).T if places.size else np.zeros(3)
+    half = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * np.array([aspect, 1.0]))
+    distance, shift = 0.0, np.zeros(2)
+    for i, (offset, angle) in enumerate(zip((across, up), half, strict=True)):
+        low, high = np.min(offset - bound), np.max(offset + bound)
+        shift[i] = (low + high) / 2.0
+        reach = (np.abs(offset - shift[i]) * np.cos(angle) + bound) / np.sin(angle) - depth
+        distance = max(distance, float(reach.max()))
+    view.lookat[:] = center + shift @ axes[:2]
+    view.distance = _MARGIN * distance
     return view
 
 
-# Text
-
-
-def _write(frame: Frame, lines: Sequence[str], time: float) -> Frame:
-    """The frame with lines of text in a translucent box at its top left."""
-    if not lines:
-        return frame
-    from PIL import Image, ImageDraw
-
-    height, width = frame.shape[:2]
-    font, box = _text_box(lines, height, width)
-    text = "\n".join(lines).replace("{time}", f"{time:.2f} s")
-    image = Image.fromarray(frame)
-    draw = ImageDraw.Draw(image, "RGBA")
-    margin = height // 40
-    fill = (150, 20, 20, 210) if _UNCERTIFIED in text else (14, 18, 25, 185)
-    draw.rounded_rectangle(box, radius=margin // 2, fill=fill)
-    corner = (2 * margin, 2 * margin)
-    draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
-    return np.asarray(image)
-
-
-def _text_box(
-    lines: Sequence[str], height: int, width: int
-) -> tuple[ImageFont.FreeTypeFont, tuple[float, float, float, float]]:
-    """The font, and the box (left, top, right, bottom) around the text with its margin."""
-    from PIL import Image, ImageDraw
-
-    text = "\n".join(lines).replace("{time}", "00.00 s")
-    font = _fitted_font(text, height, width)
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    corner = (2 * margin, 2 * margin)
-    left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
-    return font, (left - margin, top - margin, right + margin, bottom + margin)
-
-
-@lru_cache(maxsize=16)
-def _fitted_font(text: str, height: int, width: int) -> ImageFont.FreeTypeFont:
-    """The largest font, up to 1/28 of the height, with which the text fits the frame."""
-    from PIL import Image, ImageDraw
-
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    for size in range(max(9, height // 28), 8, -1):
-        font = _font(size)
-        box = draw.multiline_textbbox((0, 0), text, font, spacing=margin // 2)
-        if box[2] <= width - 4 * margin and box[3] <= height - 4 * margin:
-            break
-    return font
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans (it has mathematical signs), which matplotlib brings; else Pillow's own."""
-    from PIL import ImageFont
-
-    found = importlib.util.find_spec("matplotlib")  # located, not imported: that takes a second
-    if found is not None and found.origin is not None:
-        path = Path(found.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"
-        if path.exists():
-            return ImageFont.truetype(str(path), size)
-    font = ImageFont.load_default(size)
-    assert isinstance(font, ImageFont.FreeTypeFont)
-    return font
+def _direction(model: mujoco.MjModel) -> tuple[float, float]:
+    """Azimuth and elevation [degrees] of the camera called "main", or usual ones."""
+    main = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA.value, "main")
+    if main < 0:
+        return 110.0, -12.0
+    data = mujoco.MjData(model)
+    set_pose(model, data, model.qpos0)
+    ahead = -data.cam_xmat[main].reshape(3, 3)[:, 2]
+    azimuth, elevation = np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(ahead[2], -1.0, 1.0))
+    return float(np.degrees(azimuth)), float(np.degrees(elevation))
 
 
 # OpenGL
 
 
 @contextlib.contextmanager
-def _drawer(model: mujoco.MjModel, height: int, width: int) -> Iterator[Drawer]:
+def open_drawer(model: mujoco.MjModel, height: int, width: int) -> Iterator[Drawer]:
     """OpenGL if this machine has it, else the painter."""
     context = _gl_context()
     if context is None:

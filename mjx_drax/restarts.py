@@ -45,6 +45,7 @@ from mjx_drax.langevin import (
     evaluate,
 )
 from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.recording import Recorder, knot_defects
 from mjx_drax.schedules import Geometric
 
 CHUNK = 20
@@ -164,10 +165,12 @@ class Run(Attempt):
     """Where the chains of a solve ended, before any replay.
 
     `records` holds what every place in the batch was at, which in later attempts are other tries
-    of fewer chains.
+    of fewer chains. `began` holds for every attempt after how many iterations it began, and after
+    how many its noise ended (the same, if it had none).
     """
 
     records: list[tuple[int, Info]]
+    began: list[tuple[int, int]]
     compile_time: float
     solve_time: float
 
@@ -179,6 +182,7 @@ def run(
     solver: Langevin | Restarts,
     guess: Trajectory | None = None,
     progress: Progress | None = None,
+    recorder: Recorder | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments.
 
@@ -193,7 +197,7 @@ def run(
     solver.check(problem)
     if isinstance(solver, Langevin):
         solver = Restarts(solver, descent=None, attempts=1)
-    return _Search(problem, chains, seed, guess, progress).run(solver)
+    return _Search(problem, chains, seed, guess, progress, recorder).run(solver)
 
 
 class _Search:
@@ -206,10 +210,12 @@ class _Search:
         seed: int,
         guess: Trajectory | None,
         progress: Progress | None,
+        recorder: Recorder | None,
     ) -> None:
         self.problem, self.chains, self.seed = problem, chains, seed
-        self.guess, self.progress = guess, progress
+        self.guess, self.progress, self.recorder = guess, progress, recorder
         self.records: list[tuple[int, Info]] = []
+        self.began: list[tuple[int, int]] = []
         self.done = 0
 
     def run(self, solver: Restarts) -> Run:
@@ -226,13 +232,13 @@ class _Search:
         jax.block_until_ready(_advance(first, self.problem, state, 0, 0, int(flow.tail) > 0))
         if solver.attempts > 1:
             _gather((state, info), (state, info), np.arange(self.chains))
+        if self.recorder is not None:
+            knot_defects(self.problem, state.trajectory)
         compile_time = time.perf_counter() - clock
 
         clock = time.perf_counter()
         self.records.append((0, info))
-        kept, complete = self._attempt(first, state, info, total)
-        if complete:
-            kept, complete = self._mended(first, kept, total)
+        kept, complete = self._attempt(first, state, info, np.arange(self.chains), total)
         for attempt in range(1, solver.attempts):
             left = np.flatnonzero(~_finished(kept, solver.within, unit))
             if not complete or len(left) <= (1.0 - enough) * self.chains:
@@ -245,14 +251,12 @@ class _Search:
             elif solver.descent is not None:
                 flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
             try:
-                found, complete = self._attempt(flow, *self._start(flow, attempt), total)
-                if complete:
-                    found, complete = self._mended(flow, found, total)
+                found, complete = self._attempt(flow, *self._start(flow, attempt), owners, total)
                 kept = _best(kept, found, owners)
             except KeyboardInterrupt:  # between two attempts
                 break
         times = compile_time, time.perf_counter() - clock
-        return Run(kept.state, kept.info, kept.converged_at, self.records, *times)
+        return Run(kept.state, kept.info, kept.converged_at, self.records, self.began, *times)
 
     def _start(self, flow: Langevin, attempt: int) -> tuple[State, Info]:
         """New initial knots and random numbers for every place in the batch."""
@@ -271,7 +275,7 @@ class _Search:
         """
         if not self.problem.dynamics.kinked or kept.feasible.all() or flow.tail < STEPS:
             return kept, True
-        everyone = np.arange(self.chains)
+        everyone, total = np.arange(self.chains), flow.iterations + flow.tail
         try:
             for with_feedback in (0.0, 1.0):
                 kept = _best(kept, self._replayed(flow, kept, with_feedback), everyone)
@@ -282,7 +286,7 @@ class _Search:
                 improved = _improved(kept, found)
                 kept = _best(kept, found, everyone)
                 damping = np.clip(damping * np.where(improved, EASE, TIGHTEN), *DAMPING)
-                self._report(kept.info, expected)
+                self._report(flow, total, kept, expected)
                 if not improved.any() and (damping == DAMPING[1]).all():
                     break
         except KeyboardInterrupt:
@@ -297,11 +301,18 @@ class _Search:
         self.done += STEPS
         return Attempt(state, info, np.full(self.chains, self.done))
 
-    def _report(self, info: Info, expected: int) -> None:
-        """Record where the chains are, and tell."""
-        self.records.append((self.done, info))
+    def _report(self, flow: Langevin, step: int, at: Attempt, expected: int) -> None:
+        """Record where the chains are after `step` iterations of an attempt, and tell."""
+        self.records.append((self.done, at.info))
+        self._snap(flow, step, at.state, at.info)
         if self.progress is not None:
-            self.progress(self.done, max(expected, self.done), info)
+            self.progress(self.done, max(expected, self.done), at.info)
+
+    def _snap(self, flow: Langevin, step: int, state: State, info: Info) -> None:
+        """Record knots too, if asked for."""
+        if self.recorder is not None:
+            knots = state.trajectory
+            self.recorder.take(self.problem, flow, step, self.done, knots, info)
 
     def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float) -> Attempt:
         """Every chain's knots replaced by a replay of its controls."""
@@ -314,24 +325,41 @@ class _Search:
         return Attempt(state, info, np.full(self.chains, self.done))
 
     def _attempt(
+        self, flow: Langevin, state: State, info: Info, owners: np.ndarray, expected: int
+    ) -> tuple[Attempt, bool]:
+        """One attempt on behalf of owners (chains,), and whether it was not interrupted."""
+        noisy = int(flow.iterations) if flow.sigma(0) > 0.0 else 0
+        self.began.append((self.done, self.done + noisy))
+        if self.recorder is not None:
+            self.recorder.begin(owners)
+        self._snap(flow, 0, state, info)
+        found, complete = self._flowed(flow, state, info, expected)
+        return self._mended(flow, found, expected) if complete else (found, False)
+
+    def _flowed(
         self, flow: Langevin, state: State, info: Info, expected: int
     ) -> tuple[Attempt, bool]:
-        """All iterations of one attempt, and whether it was not interrupted."""
+        """All iterations of one attempt, and whether they were not interrupted."""
         total, tail = flow.iterations + flow.tail, int(flow.tail) > 0
-        done, before, converged_at = 0, self.done, np.full(self.chains, -1)
+        done, before, at = 0, self.done, Attempt(state, info, np.full(self.chains, -1))
         try:
             while done < total:
-                stop = min(done + max(CHUNK, total // 100), total)
-                ahead = _advance(flow, self.problem, state, done, stop, tail)
+                stop = min(done + self._stride(total), total)
+                ahead = _advance(flow, self.problem, at.state, done, stop, tail)
                 (state, info), done = jax.block_until_ready(ahead), stop
                 self.done = before + done
                 feasible = np.asarray(info.max_defect) < FEASIBLE
-                converged_at = np.where(feasible & (converged_at < 0), self.done, converged_at)
-                converged_at = np.where(feasible, converged_at, -1)
-                self._report(info, expected)
+                since = np.where(at.converged_at < 0, self.done, at.converged_at)
+                at = Attempt(state, info, np.where(feasible, since, -1))
+                self._report(flow, done, at, expected)
         except KeyboardInterrupt:  # the chains as they were at the last report
-            return Attempt(state, info, converged_at), False
-        return Attempt(state, info, converged_at), True
+            return at, False
+        return at, True
+
+    def _stride(self, total: int) -> int:
+        """Iterations up to the next report, for an attempt of so many."""
+        usual = max(CHUNK, total // 100)
+        return usual if self.recorder is None else min(usual, self.recorder.every)
 
 
 @partial(jax.jit, static_argnames="tail")

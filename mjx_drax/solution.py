@@ -13,7 +13,7 @@ within `TRACKED` of the plan.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Langevin, evaluate, feedback_gains
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
+from mjx_drax.recording import Recorder, Recording
 from mjx_drax.restarts import Progress, Restarts, Run, run
 
 if TYPE_CHECKING:
@@ -97,9 +98,12 @@ class Solution:
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
         open_loop, feedback: the replays of every chain.
         history: `iteration` (records,), and `cost`, `max_defect` (records, chains) of every place
-            in the batch, which in later attempts of `Restarts` hold tries for unfinished chains.
+            in the batch, which in later attempts of `Restarts` hold tries for unfinished chains;
+            `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
+            its noise ended (the same, if it had none).
         iterations: how many were done.
         compile_time, solve_time: [s].
+        recording: the chains' knots over the iterations, where `solve` was asked to record them.
     """
 
     problem: Problem
@@ -119,6 +123,7 @@ class Solution:
     iterations: int
     compile_time: float
     solve_time: float
+    recording: Recording | None = None
 
     @property
     def chains(self) -> int:
@@ -222,6 +227,7 @@ def solve(
     solver: Langevin | Restarts | None = None,
     guess: Trajectory | None = None,
     progress: Progress | None = None,
+    record: int | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
 
@@ -235,6 +241,9 @@ def solve(
             (K, nu), or one each, (chains, K, nx) and (chains, K, nu). They need not be feasible.
         progress: called with (iterations done, of how many, diagnostics) every few iterations;
             Ctrl-C between two calls ends the solve early and keeps what there is.
+        record: keep the knots of all chains every so many iterations, in `solution.recording`, for
+            `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
+            and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
 
     Returns:
         the solution with its certificate; look at `solution.certified`.
@@ -246,7 +255,10 @@ def solve(
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     solver = solver or Restarts()
-    return _certified(problem, solver, seed, run(problem, chains, seed, solver, guess, progress))
+    recorder = None if record is None else Recorder(record)
+    found = run(problem, chains, seed, solver, guess, progress, recorder)
+    solution = _certified(problem, solver, seed, found)
+    return solution if recorder is None else replace(solution, recording=recorder.recording())
 
 
 def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Run) -> Solution:
@@ -276,6 +288,8 @@ def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Ru
             "iteration": np.array([done for done, _ in records]),
             "cost": np.stack([np.asarray(i.cost) for _, i in records]),
             "max_defect": np.stack([np.asarray(i.max_defect) for _, i in records]),
+            "began": np.array([began for began, _ in run.began]),
+            "noise_ends": np.array([end for _, end in run.began]),
         },
         iterations=records[-1][0],
         compile_time=run.compile_time,

@@ -77,7 +77,7 @@ def test_list_names_every_task(capsys):
 def test_own_model_is_certified_and_written(own, capsys):
     status = main(
         f"solve --model {own}/slider.xml --cost {own}/mycost.py --chains 4 --iterations 30 "
-        f"--seed 3 --out {own}/out".split()
+        f"--seed 3 --out {own}/out --film {own}/film.gif --fps 5 --size 160x120".split()
     )
     assert status == 0
     out = capsys.readouterr().out
@@ -105,7 +105,9 @@ def test_own_model_is_certified_and_written(own, capsys):
     assert arrays["chain_cost"].shape == (4,)
     np.testing.assert_allclose(arrays["replayed_states"][-1, 0], 0.2, atol=0.01)
     assert (own / "out" / "video.mp4").stat().st_size > 1000
-    assert (own / "out" / "plot.png").stat().st_size > 1000
+    for name in ("plot.png", "phase.png", "multipliers.png", "timelapse.png"):
+        assert (own / "out" / name).stat().st_size > 1000
+    assert (own / "film.gif").read_bytes().startswith(b"GIF")
 
 
 def test_status_is_1_when_not_certified(tmp_path, capsys):
@@ -130,6 +132,11 @@ def test_errors_name_cause_and_fix(own, capsys):
     assert "scalar" in error_of(capsys, "solve", "--model", model, "--cost", cost)
     (own / "mycost.py").write_text("def terminal_cost(data):\n    return data.qpos[0]")
     assert "--horizon" in error_of(capsys, "solve", "--model", model, "--cost", cost)
+    at = ["--out", str(own / "out")]
+    assert "draw=" in error_of(capsys, "solve", "pendulum", "--film", *at)
+    assert ".gif" in error_of(capsys, "solve", "bug_trap", "--film", "film.avi", *at)
+    assert "speed" in error_of(capsys, "solve", "bug_trap", "--speed", "0", *at)
+    assert "main" in error_of(capsys, "solve", "cartpole_swingup", "--camera", "side", *at)
     (own / "file").write_text("")
     assert "--out" in error_of(capsys, "solve", "pendulum", "--out", str(own / "file"))
 

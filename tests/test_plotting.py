@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import matplotlib
+import mujoco
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from PIL import Image
 
-from mjx_drax import plotting
+from mjx_drax import plotting, portraits
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import Langevin
 from mjx_drax.plotting import plot_solution
@@ -91,7 +95,7 @@ def test_one_chain(tmp_path: Path) -> None:
 def test_diverged_chains_and_replays(pendulum: Solution, kind: str, tmp_path: Path) -> None:
     died = np.arange(8) >= (3 if kind == "some" else 0)
     history = {
-        "iteration": pendulum.history["iteration"],
+        **pendulum.history,
         "cost": np.where(died, np.nan, pendulum.history["cost"]),
         "max_defect": np.where(died, np.nan, pendulum.history["max_defect"]),
     }
@@ -140,3 +144,59 @@ def test_paths_that_cannot_be_written(pendulum: Solution, tmp_path: Path) -> Non
         plot_solution(pendulum, tmp_path / "plot.pdf")
     with pytest.raises(DraxError, match="cannot write"):
         plot_solution(pendulum, tmp_path / "file" / "plot.png")
+
+
+def _dynamics(name: str) -> SimpleNamespace:
+    path = Path(__file__).parents[1] / "models" / f"{name}.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    return SimpleNamespace(mj_model=model, ndx=2 * model.nv + model.na)
+
+
+def test_quaternions_have_a_panel_of_their_own() -> None:
+    groups = dict(plotting._state_groups(_dynamics("quadrotor")))  # type: ignore[arg-type]
+    assert list(groups) == ["positions", "orientations", "velocities"]
+    assert groups["positions"] == {0: "root x [m]", 1: "root y [m]", 2: "root z [m]"}
+    assert groups["orientations"][3] == "root qw"
+    assert list(groups["velocities"]) == [7, 8, 9, 10, 11, 12]
+    assert groups["velocities"][12] == "root turn z [rad/s]"
+
+
+def test_phase_portraits_of_turns_are_in_tangent_space() -> None:
+    quadrotor: Any = _dynamics("quadrotor")
+    assert [c.position for c in portraits.coordinates(quadrotor)[2:4]] == [
+        "root z [m]",
+        "root turn x [rad]",
+    ]
+    assert len(portraits._tangent_names(quadrotor)) == 12
+    angle = np.linspace(0.0, 3.0, 5)
+    states = np.zeros((5, 13))
+    states[:, 0], states[:, 12] = 2.0, 1.5
+    states[:, 3], states[:, 6] = np.cos(angle / 2), np.sin(angle / 2)
+    positions, velocities = portraits._phases(quadrotor, states)
+    np.testing.assert_allclose(positions[:, 5], angle, atol=1e-9)
+    np.testing.assert_array_equal(positions[:, 0], 2.0)
+    np.testing.assert_array_equal(velocities[:, 5], 1.5)
+
+
+def test_portraits(pendulum: Solution, cartpole: Solution, tmp_path: Path) -> None:
+    for solution, width in ((pendulum, 780), (cartpole, 960)):
+        assert _size(portraits.plot_phase(solution, tmp_path / "phase.png"))[0] == width
+    for solution, rows in ((pendulum, 2), (cartpole, 4)):
+        size = _size(portraits.plot_multipliers(solution, tmp_path / "multipliers.png"))
+        assert size == (1050, round(150 * (0.24 * rows + 1.7)))
+
+
+def test_what_has_no_phases(tmp_path: Path) -> None:
+    problem = SimpleNamespace(name="three", dynamics=SimpleNamespace(nx=3))
+    three: Any = SimpleNamespace(problem=problem)
+    with pytest.raises(DraxError, match="which of them are velocities"):
+        portraits.plot_phase(three, tmp_path / "phase.png")
+
+
+def test_marks_are_where_attempts_began(pendulum: Solution) -> None:
+    began, ended = np.array([0, 31]), np.array([0, 44])
+    marked = replace(pendulum, history={**pendulum.history, "began": began, "noise_ends": ended})
+    axes = Figure().add_subplot()
+    plotting._draw_defects(axes, marked)
+    marks = {line.get_xdata()[0] for line in axes.lines if len(set(line.get_xdata())) == 1}
+    assert marks == {31, 44}

@@ -72,6 +72,7 @@ def test_attempts_share_one_compilation():
     before = restarts._advance._cache_size()
     found = run(PROGRAM, 8, 0, Restarts(SHORT, attempts=3, enough=2.0))
     assert found.records[-1][0] == 120 + 2 * 60
+    assert found.began == [(0, 0), (120, 160), (180, 220)]  # the first has no noise
     assert restarts._advance._cache_size() - before == 1
 
 
@@ -186,11 +187,16 @@ def bouncing():
 
 def test_replays_lead_on_where_f_has_kinks(bouncing):
     """The same dynamics with and without being told of the kink."""
-    plain, kinked = (solve(p, chains=16, solver=Restarts(attempts=1)) for p in bouncing)
+    solver = Restarts(attempts=1)
+    plain, kinked = (solve(p, chains=16, solver=solver, record=10) for p in bouncing)
     assert not plain.feasible.any()
     assert kinked.feasible.mean() > 0.9
     assert kinked.certified
     assert kinked.iterations > plain.iterations
+    for chain in range(16):  # recorded all the way
+        path = kinked.recording.path(chain)
+        np.testing.assert_array_equal(path.x[-1], kinked.trajectories.x[chain])
+        assert path.iteration[-1] == kinked.iterations
 
 
 def test_interrupted_while_replays_lead_on_keeps_what_there_is(bouncing):

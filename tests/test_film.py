@@ -1,0 +1,283 @@
+"""Recordings of solves, the film of a diffusion, the time-lapse, and files of films."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from PIL import Image
+
+from mjx_drax import film, ghosts, movie, recording, rendering
+from mjx_drax.errors import DraxError
+from mjx_drax.langevin import Langevin
+from mjx_drax.recording import Recorder, Recording, Snapshot, Tries
+from mjx_drax.schedules import Constant
+from mjx_drax.solution import Solution, solve
+from mjx_drax.tasks import load
+
+SHORT = Langevin(iterations=6, tail=4, noise=Constant(0.1))
+
+
+@pytest.fixture(scope="module")
+def trapped() -> Solution:
+    """A function that brings a drawing."""
+    return solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT, record=2)
+
+
+@pytest.fixture(scope="module")
+def cartpole() -> Solution:
+    problem = load("cartpole_swingup").make(horizon=0.2)
+    return solve(problem, chains=2, solver=Langevin(iterations=3, tail=1), record=1)
+
+
+def _snapshot(iteration: int, cost: list[float], max_defect: list[float]) -> Snapshot:
+    places = len(cost)
+    x = np.full((places, 4, 2), float(iteration)) + np.arange(places)[:, None, None]
+    arrays = np.zeros((places, 4)), np.array(cost), np.array(max_defect)
+    return Snapshot(iteration, 0.0, x, *arrays)
+
+
+def test_recording_does_not_change_the_answer(trapped: Solution) -> None:
+    plain = solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT)
+    np.testing.assert_array_equal(plain.trajectories.x, trapped.trajectories.x)
+    np.testing.assert_array_equal(plain.gains, trapped.gains)
+    assert plain.recording is None
+
+
+def test_a_path_begins_scattered_and_ends_at_the_answer(trapped: Solution) -> None:
+    assert trapped.recording is not None
+    for chain in range(3):
+        path = trapped.recording.path(chain)
+        np.testing.assert_array_equal(path.iteration, [0, 2, 4, 6, 8, 10])
+        np.testing.assert_array_equal(path.x[-1], trapped.trajectories.x[chain])
+        np.testing.assert_allclose(path.max_defect, path.defects.max(axis=1), rtol=1e-6)
+        np.testing.assert_allclose(path.sigma, [0.1, 0.1, 0.1, 0.0, 0.0, 0.0], rtol=1e-6)
+        assert path.max_defect[-1] == trapped.max_defect[chain]
+        assert np.abs(path.x[0] - path.x[-1]).max() > 0.1
+
+
+def test_a_path_follows_the_best_try_of_each_attempt_up_to_the_answer() -> None:
+    first = Tries(np.arange(3), [_snapshot(0, [9, 9, 9], [5, 5, 5])])
+    first.snapshots.append(_snapshot(10, [1.0, 5.0, 0.1], [1e-6, 1e-6, 0.5]))
+    second = Tries(np.array([1, 2, 2]), [_snapshot(10, [9, 9, 9], [5, 5, 5])])
+    second.snapshots.append(_snapshot(20, [6.0, 4.0, 3.0], [1e-6, 1e-6, 1e-6]))
+    attempts = Recording([first, second])
+    assert list(attempts.path(0).iteration) == [0, 10]  # the second did not work for it
+    assert list(attempts.path(1).iteration) == [0, 10]  # the second was worse
+    path = attempts.path(2)  # two tries, and the last place's is the cheaper
+    assert list(path.attempt) == [0, 0, 1, 1]
+    assert list(path.cost) == pytest.approx([9.0, 0.1, 9.0, 3.0])
+    assert list(path.x[:, 0, 0]) == [2.0, 12.0, 12.0, 22.0]
+
+
+def test_memory_is_bounded(trapped: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert trapped.recording is not None
+    size = trapped.recording.attempts[0].snapshots[0].size
+    monkeypatch.setattr(recording, "LIMIT", 8 * size)
+    solver = Langevin(iterations=30, tail=11, noise=Constant(0.1))
+    many = solve(load("bug_trap").make(horizon=1.0), chains=3, solver=solver, record=1)
+    assert many.recording is not None
+    shots = many.recording.attempts[0].snapshots
+    assert sum(shot.size for shot in shots) <= 8 * size
+    assert len(shots) > 3
+    assert (shots[0].iteration, shots[-1].iteration) == (0, 41)
+
+
+def test_what_cannot_be_recorded() -> None:
+    for every in (0, 1.5, -1):
+        with pytest.raises(DraxError, match="record is"):
+            Recorder(every)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("painted", [False, True])
+def test_film_of_a_model(
+    cartpole: Solution, painted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if painted:
+        monkeypatch.setattr(rendering, "_gl_context", lambda: None)
+    path = film.render_diffusion(
+        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(180, 240), ghosts=4
+    )
+    with Image.open(path) as image:
+        assert image.size == (240, 180)
+        # The scattered knots, their way, the end; then two tenths of a second, and it is held.
+        frames = []
+        for i in range(image.n_frames):  # type: ignore[attr-defined]
+            image.seek(i)
+            frames.append(np.asarray(image.convert("RGB"), int))
+    scene = frames[0][:130]
+    difference = [np.abs(frame - frames[0]).mean() for frame in frames]
+    assert difference[-1] > 2.0
+    assert (scene[..., 0] > scene[..., 2] + 90).sum() > 50  # ghosts that break the dynamics
+    assert [item.name for item in path.parent.iterdir()] == ["film.webp"]
+
+
+def test_film_of_a_function(trapped: Solution, tmp_path: Path) -> None:
+    draw = load("bug_trap").draw
+    path = film.render_diffusion(
+        trapped, tmp_path / "film.mp4", seconds=0.4, fps=5, size=(200, 300), draw=draw
+    )
+    assert path.stat().st_size > 2000
+
+
+def test_paths_are_where_the_task_draws_them() -> None:
+    def draw(axes: Axes, states: np.ndarray) -> None:
+        axes.plot([0, 1], [0, 1])
+        axes.plot(10 * states[:, 1], states[:, 0])
+
+    states = np.random.default_rng(0).normal(size=(3, 4, 2))
+    points = film._traced(draw, states)
+    np.testing.assert_array_equal(points, states[..., ::-1] * [10, 1])
+    with pytest.raises(DraxError, match="one vertex for each state"):
+        film._traced(lambda axes, states: None, states)
+
+
+def test_colors_go_from_feasible_to_the_worst() -> None:
+    colors = film.Colors(10.0)
+    shades = colors([1e-9, 1e-3, 10.0, 99.0, np.nan])
+    np.testing.assert_array_equal(shades[0], shades[1])
+    np.testing.assert_array_equal(shades[2:], shades[[2, 2, 2]])
+    assert shades[0, 2] > 0.8 > 0.2 > shades[2, 2]  # blue and not
+
+
+def test_film_time_is_spent_where_knots_move() -> None:
+    x = np.zeros((21, 3, 1))
+    x[:, :, 0] = np.array([1.0, 2.0, 4.0]) * 0.3 ** np.arange(21)[:, None]
+    path = recording.Path(
+        iteration=np.arange(21),
+        sigma=np.zeros(21),
+        cost=np.ones(21),
+        max_defect=x.max(axis=(1, 2)),
+        attempt=np.zeros(21, int),
+        x=x,
+        defects=x[..., 0],
+    )
+    at = film._positions(path, 4.0, 25.0)
+    assert (at[0], at[-1]) == (0.0, 20.0)
+    assert (np.diff(at) >= 0.0).all()
+    assert np.median(at) < 5.0
+
+
+def _timeline(iteration: list[int], attempt: list[int]) -> recording.Path:
+    count = len(iteration)
+    numbers = np.ones(count)
+    return recording.Path(
+        iteration=np.array(iteration),
+        sigma=numbers,
+        cost=numbers,
+        max_defect=numbers,
+        attempt=np.array(attempt),
+        x=np.ones((count, 2, 1)),
+        defects=np.ones((count, 2)),
+    )
+
+
+def test_other_chains_are_shown_at_the_same_time() -> None:
+    one = _timeline([0, 2, 4, 4, 6], [0, 0, 0, 1, 1])
+    early, late = _timeline([0, 4], [0, 0]), _timeline([0, 4, 4, 8, 8, 12], [0, 0, 1, 1, 2, 2])
+    assert film._moment(one, late, 0.5) == (0, 1, 0.25)
+    assert film._moment(one, late, 2.0) == (1, 1, 0.0)  # its first attempt ends as well
+    assert film._moment(one, late, 3.0) == (2, 3, 0.0)  # the second begins
+    assert film._moment(one, late, 3.5) == (2, 3, 0.25)
+    assert film._moment(one, late, 4.0) == (5, 5, 0.0)  # its answer
+    assert film._moment(one, early, 3.5) == (1, 1, 0.0)
+
+
+def test_what_cannot_be_filmed(trapped: Solution, cartpole: Solution, tmp_path: Path) -> None:
+    target = tmp_path / "film.mp4"
+    bare = solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT)
+    with pytest.raises(DraxError, match="record=1"):
+        film.render_diffusion(bare, target)
+    with pytest.raises(DraxError, match="pass draw="):
+        film.render_diffusion(trapped, target)
+    for name, value in {"seconds": 0, "ghosts": -1, "chains": 0, "fps": 0, "speed": -1}.items():
+        with pytest.raises(DraxError, match=name):
+            film.render_diffusion(cartpole, target, **{name: value})  # type: ignore[arg-type]
+    with pytest.raises(DraxError, match="no camera 'side'"):
+        film.render_diffusion(cartpole, target, camera="side")
+    with pytest.raises(DraxError, match=r"\.gif"):
+        film.render_diffusion(cartpole, tmp_path / "film.avi")
+    assert not list(tmp_path.iterdir())
+
+
+def test_timelapse(cartpole: Solution, tmp_path: Path) -> None:
+    pictures = {}
+    for count in (1, 2, 6):
+        path = ghosts.render_timelapse(
+            cartpole, tmp_path / f"{count}.png", count=count, size=(120, 160)
+        )
+        with Image.open(path) as image:
+            assert image.size == (160, 120)
+            pictures[count] = np.asarray(image.convert("RGB"), int)
+    assert 0 < np.abs(pictures[2] - pictures[1]).mean() < np.abs(pictures[6] - pictures[1]).mean()
+
+
+def test_what_has_no_timelapse(cartpole: Solution, trapped: Solution, tmp_path: Path) -> None:
+    with pytest.raises(DraxError, match="no model"):
+        ghosts.render_timelapse(trapped, tmp_path / "a.png")
+    with pytest.raises(DraxError, match="count"):
+        ghosts.render_timelapse(cartpole, tmp_path / "a.png", count=0)
+    with pytest.raises(DraxError, match=r"\.png"):
+        ghosts.render_timelapse(cartpole, tmp_path / "a.jpg")
+
+
+def test_bodies_that_travel() -> None:
+    names = {"cartpole": None, "quadrotor": "quadrotor", "car_bug_trap": "car"}
+    for name, body in names.items():
+        path = Path(__file__).parents[1] / "models" / f"{name}.xml"
+        model = mujoco.MjModel.from_xml_path(str(path))
+        index = ghosts.travelling_body(model)
+        assert (None if index is None else model.body(index).name) == body
+        if index is not None:
+            start = ghosts.places(model, index, np.tile(model.qpos0, (2, 3, 1)))
+            assert start.shape == (2, 3, 3)
+
+
+def _frames(count: int) -> Iterator[np.ndarray]:
+    for i in range(count):
+        frame = np.full((20, 30, 3), 200, np.uint8)
+        frame[:, i : i + 5] = (180, 40, 20)
+        yield frame
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_animations_loop_in_time(suffix: str, tmp_path: Path) -> None:
+    path = movie.write(tmp_path / f"a{suffix}", (f for f in _frames(12)), 24.0, (20, 30))
+    with Image.open(path) as image:
+        assert image.n_frames == 12  # type: ignore[attr-defined]
+        assert image.info["loop"] == 0
+        lasted = 0
+        for i in range(12):
+            image.seek(i)
+            image.load()
+            lasted += image.info["duration"]
+            red = np.asarray(image.convert("RGB"), int)[10]
+            assert red[i + 2, 0] > red[i + 2, 1] + 80
+    assert lasted == 500
+
+
+def test_slow_motion_and_the_free_camera() -> None:
+    times = np.array([0.0, 1.0])
+    assert len(rendering.frame_times(times, 10.0, 0.5)) == 21 + 5
+    with pytest.raises(DraxError, match="speed"):
+        rendering.frame_times(times, 10.0, 0.0)
+    path = Path(__file__).parents[1] / "models" / "cartpole.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    poses = np.array([[0.5, 0.0], [0.7, 3.0]])
+    near = rendering.view_of(model, poses, rendering.FREE, 1.3)
+    far = rendering.view_of(model, np.array([[-1.8, 0.0], [1.8, 3.0]]), rendering.FREE, 1.3)
+    assert near.azimuth == pytest.approx(90.0)  # as the camera "main" looks
+    assert 0.4 < near.lookat[0] < 0.8
+    assert far.distance > 1.5 * near.distance
+    assert rendering.view_of(model, poses, None, 1.3).fixedcamid == 0
+
+
+def test_what_a_solve_could_not_film_is_refused_before_it() -> None:
+    problem = SimpleNamespace(dynamics=SimpleNamespace(), name="thing")
+    with pytest.raises(DraxError, match="thing has no model"):
+        rendering.check(problem)  # type: ignore[arg-type]
