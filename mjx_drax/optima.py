@@ -161,9 +161,7 @@ def _optimum(solution: Solution, members: np.ndarray) -> Optimum:
         share=len(members) / solution.chains,
         cost=float(solution.cost[chain]),
         max_defect=float(solution.max_defect[chain]),
-        certificate=Certificate(
-            solution.problem.dynamics.engine, open_loop.summary(chain), feedback.summary(chain)
-        ),
+        certificate=Certificate(solution.engine, open_loop.summary(chain), feedback.summary(chain)),
         trajectory=jax.tree.map(lambda a: a[chain], solution.trajectories),
         replayed=(replays.states[chain], replays.controls[chain]),
     )
