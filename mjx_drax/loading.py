@@ -1,7 +1,7 @@
 """Solutions from the files that `results.save` wrote.
 
-A solution that is loaded without its problem gets a stand-in: with the sizes, times, bounds and, for
-MJCF, the model of what was solved. Whatever needs a function of the problem raises a DraxError.
+A solution that is loaded without its problem gets a stand-in: with the sizes, times, bounds and,
+for MJCF, the model of what was solved. Whatever needs a function of the problem raises a DraxError.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
 
 def _solution(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> Solution:
     multipliers = Multipliers(
-        arrays["solution.multipliers.dynamics"],
+        arrays["solution.multipliers.dynamics"],  # type: ignore[arg-type]
         _stagewise("solution.multipliers.constraints", arrays),
         (
             (

@@ -93,9 +93,7 @@ def distinct(solution: Solution, tolerance: float = TOLERANCE) -> tuple[Optimum,
     """
     if not (isinstance(tolerance, float | int | np.number) and tolerance > 0):
         raise DraxError(f"tolerance is {tolerance!r}: give a positive number, such as {TOLERANCE}.")
-    certified = np.flatnonzero(
-        solution.feasible & (solution.feedback.success | solution.open_loop.success)
-    )
+    certified = np.flatnonzero(solution.certified_chains)
     if not certified.size:
         return ()
     order = certified[np.argsort(solution.cost[certified], kind="stable")]

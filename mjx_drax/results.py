@@ -1,4 +1,4 @@
-"""Result files: `result.json` for reading, `result.npz` for computing, both to load a solution again.
+"""Result files: `result.json` for reading, `result.npz` for computing, both to load again.
 
 Functions are code and are not saved: a loaded solution has everything but costs, constraints, goal
 and, without an MJCF, dynamics (see `loading`).

@@ -151,6 +151,11 @@ class Solution:
         return list(np.where(self.died_at >= 0, DIVERGED, names))
 
     @cached_property
+    def certified_chains(self) -> np.ndarray:
+        """Whether a chain is feasible and one of its replays succeeds, (chains,)."""
+        return self.feasible & (self.open_loop.success | self.feedback.success)
+
+    @cached_property
     def tracked(self) -> np.ndarray:
         """Whether a chain is feasible, and a replay of it succeeds and ends as planned, (chains,).
 
@@ -162,8 +167,7 @@ class Solution:
     @cached_property
     def best_chain(self) -> int:
         """The cheapest that is tracked, succeeds or is feasible; else the least infeasible."""
-        succeeds = self.feasible & (self.success | self.open_loop.success)
-        for eligible in (self.tracked, succeeds, self.feasible):
+        for eligible in (self.tracked, self.certified_chains, self.feasible):
             if eligible.any():
                 return int(np.argmin(np.where(eligible, self.cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
