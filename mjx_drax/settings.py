@@ -122,7 +122,10 @@ def changed(solver: Solver, name: str, text: str) -> Solver:
 def _changed(part: Any, path: list[str], name: str, text: str) -> Any:
     old = getattr(part, path[0])
     inner = _changed(old, path[1:], name, text) if len(path) > 1 else _value(old, name, text)
-    return replace(part, **{path[0]: inner})
+    new = {path[0]: inner}
+    if isinstance(part, Geometric) and path[0] == "end" and part.final == part.end:
+        new["final"] = inner  # it was not given, and follows
+    return replace(part, **new)
 
 
 def _value(old: Any, name: str, text: str) -> Any:
