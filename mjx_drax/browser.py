@@ -293,8 +293,9 @@ def _add_robot(
             continue
         name, body = f"/{part}/{shape.body}", shape.body
         if body not in frames:
-            place = {"position": motion[0][0, body], "wxyz": motion[1][0, body]}
-            frames[body] = (scene.add_frame(name, show_axes=False, **place), motion, body)
+            position, wxyz = motion[0][0, body], motion[1][0, body]
+            frame = scene.add_frame(name, show_axes=False, position=position, wxyz=wxyz)
+            frames[body] = (frame, motion, body)
         _add_shape(scene, f"{name}/{shape.label}", shape, 1.0, tint)
     return list(frames.values())
 
@@ -305,15 +306,23 @@ def _add_shape(
     rgb, opacity, scale = shape.rgba[:3], float(shape.rgba[3]), 1.0
     if tint is not None:
         rgb, opacity, scale = tint, opacity * _PLAN_OPACITY, _PLAN_SCALE
-    place = {"position": shape.position, "wxyz": shape.wxyz}
     if shape.mesh is None:
         width, height = np.where(shape.size[:2] > 0.0, 2.0 * shape.size[:2], _FLOOR * extent)
-        cell = 10.0 ** np.round(np.log10(extent / 4.0))
-        colors = {"plane_color": _bytes(rgb), "cell_color": _bytes(0.85 * rgb)}
-        colors["section_color"] = _bytes(0.75 * rgb)
-        sizes = {"width": float(width), "height": float(height), "cell_size": cell}
-        sizes["section_size"] = 5.0 * cell
-        scene.add_grid(name, plane="xy", plane_opacity=opacity, **sizes, **colors, **place)
+        cell = float(10.0 ** np.round(np.log10(extent / 4.0)))
+        scene.add_grid(
+            name,
+            plane="xy",
+            width=float(width),
+            height=float(height),
+            cell_size=cell,
+            section_size=5.0 * cell,
+            plane_color=_bytes(rgb),
+            cell_color=_bytes(0.85 * rgb),
+            section_color=_bytes(0.75 * rgb),
+            plane_opacity=opacity,
+            position=shape.position,
+            wxyz=shape.wxyz,
+        )
         return
     vertices, faces = _triangles(shape.mesh)
     scene.add_mesh_simple(
@@ -325,7 +334,8 @@ def _add_shape(
         flat_shading=not shape.smooth,
         side="front" if shape.closed else "double",
         scale=scale,
-        **place,
+        position=shape.position,
+        wxyz=shape.wxyz,
     )
 
 
