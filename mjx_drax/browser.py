@@ -53,7 +53,7 @@ _FLOOR = 20.0  # half side of a floor without end, in extents of the model
 _BANNER = """\
 <title>{name}</title>
 <style>
-#drax {{ position: fixed; left: 12px; top: 12px; z-index: 10; pointer-events: none;
+#drax {{ position: fixed; left: 12px; bottom: 54px; z-index: 10; pointer-events: none;
   padding: 8px 12px; border-radius: 6px; color: #f0f3f7; background: {background};
   font: 13px/1.5 system-ui, sans-serif; white-space: pre }}
 </style>"""
@@ -146,7 +146,7 @@ def _recorded(solution: Solution, ghosts: int) -> str:
     follows = certificate.open_loop if solution.replay_mode == OPEN_LOOP else certificate.feedback
     with _server() as server:
         scene = server.scene
-        shapes = _shapes(model, states[0], server)
+        shapes = _shapes(model, states[: len(replayed[0])], server)
         _add_world(scene, shapes, model)
         frames = _add_robot(scene, "replay", shapes, replayed, None)
         frames += _add_robot(scene, "plan", shapes, planned, _PLAN_COLOR)
@@ -199,15 +199,15 @@ class _Shape:
     rgba: Floats
 
 
-def _shapes(model: mujoco.MjModel, state: Floats, server: viser.ViserServer) -> list[_Shape]:
+def _shapes(model: mujoco.MjModel, states: Floats, server: viser.ViserServer) -> list[_Shape]:
     """What MuJoCo's viewer shows of the model; points the camera as films do."""
     from mjx_drax import rendering
 
     data = mujoco.MjData(model)
-    set_state(model, data, state)
+    set_state(model, data, states[0])
     mujoco.mj_forward(model, data)
     scene = mujoco.MjvScene(model, maxgeom=10_000)
-    view = rendering._camera(model, state[None, : model.nq], None, 16 / 9)
+    view = rendering._camera(model, states[:, : model.nq], None, 16 / 9)
     everything = mujoco.mjtCatBit.mjCAT_ALL.value
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, view, everything, scene)
     _point_camera(server, scene, model)
