@@ -18,9 +18,13 @@ if TYPE_CHECKING:
     from mjx_drax.bounds import LogBarrier as LogBarrier
     from mjx_drax.bounds import Projection as Projection
     from mjx_drax.bounds import Reflection as Reflection
+    from mjx_drax.browser import save_html as save_html
     from mjx_drax.derivatives import Autodiff as Autodiff
     from mjx_drax.derivatives import Smoothed as Smoothed
     from mjx_drax.errors import DraxError as DraxError
+    from mjx_drax.export import export_keyframes as export_keyframes
+    from mjx_drax.export import save_csv as save_csv
+    from mjx_drax.export import save_dataset as save_dataset
     from mjx_drax.film import render_diffusion as render_diffusion
     from mjx_drax.ghosts import render_timelapse as render_timelapse
     from mjx_drax.langevin import Langevin as Langevin
@@ -47,6 +51,10 @@ __version__ = "0.1.0"
 _HOME = {
     "LogBarrier": "bounds",
     "DraxError": "errors",
+    "export_keyframes": "export",
+    "save_csv": "export",
+    "save_dataset": "export",
+    "save_html": "browser",
     "Langevin": "langevin",
     "from_mjcf": "mjcf",
     "GaussNewton": "precondition",

@@ -62,6 +62,14 @@ _PROBLEM_NAMES = (
 if TYPE_CHECKING:
     Asked = tuple[Problem, Langevin | Restarts, int, Callable[..., Any] | None]
 
+EXPORTS = {
+    "html": ("replay.html", 'the replay for any browser, one file; pip install "mjx-drax[html]"'),
+    "csv": ("replay.csv", "times, states and controls of the replay as a table"),
+    "keyframes": ("keyframes.xml", "the model with the replay as keyframes, for MuJoCo's viewers"),
+    "dataset": ("dataset.h5", 'all certified chains as HDF5; pip install "mjx-drax[dataset]"'),
+}
+"""Files that are written if asked for: flags, names and what they hold."""
+
 OPTIMA = 5
 """So many distinct optima are printed."""
 
@@ -77,6 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except DraxError as error:
         print(f"mjx-drax: error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("mjx-drax: interrupted", file=sys.stderr)
+        return 130
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -143,7 +154,30 @@ def _parser() -> argparse.ArgumentParser:
     solving.add_argument(
         "--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion"
     )
+    _add_exports(solving)
+    solving.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting of the solver, as in attempts=3, flow.tail=100 or "
+        "flow.noise=Geometric(3,0.001); again for more; a wrong name lists them all",
+    )
+    solving.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    solving.add_argument(
+        "--json", action="store_true", help="print result.json, and nothing else, to stdout"
+    )
     solving.set_defaults(run=_solve)
+
+    exporting = commands.add_parser(
+        "export",
+        help="more files from a result that `solve` has written",
+        description="Write more files into a folder that `mjx-drax solve` or Solution.save wrote.",
+    )
+    exporting.add_argument("folder", metavar="DIR", help="such as out/cartpole_swingup")
+    _add_exports(exporting)
+    exporting.set_defaults(run=_export)
 
     measuring = commands.add_parser(
         "benchmark",
@@ -181,6 +215,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     reproducing.set_defaults(run=_reproduce)
     return parser
+
+
+def _add_exports(parser: argparse.ArgumentParser) -> None:
+    for name, (file, what) in EXPORTS.items():
+        parser.add_argument(f"--{name}", action="store_true", help=f"write {file}: {what}")
 
 
 def _positive(text: str) -> int:
@@ -226,23 +265,34 @@ def _solve(options: argparse.Namespace) -> int:
     problem, solver, chains, draw = (
         _own_problem(options) if options.task is None else _task(options)
     )
-    from mjx_drax import results
+    from mjx_drax import results, settings
     from mjx_drax.restarts import with_iterations
     from mjx_drax.solution import solve
 
     if options.iterations is not None:
         solver = with_iterations(solver, options.iterations)
+    for name, value in map(_assignment, options.settings):
+        solver = settings.changed(solver, name, value)
+    solver.check(problem)
+    exports = _exports(options)
+    _require_exports(problem, exports)
     folder = results.writable(options.out or Path("out") / problem.name)
     look = {n: getattr(options, n) for n in ("camera", "size", "fps", "speed")}
     look = {name: value for name, value in look.items() if value is not None}
     film = _film(options, folder, problem, draw, look)
     _cache_compilations()
+    tell = _silent if options.quiet or options.json else say
 
     chains = options.chains or chains
-    say(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
+    tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
     with _Bar() as bar:
         solution = solve(
-            problem, chains, options.seed, solver, progress=bar, record=1 if film else None
+            problem,
+            chains,
+            options.seed,
+            solver,
+            progress=None if options.quiet else bar,
+            record=1 if film else None,
         )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *_pictures(solution, folder, draw)]
@@ -252,10 +302,14 @@ def _solve(options: argparse.Namespace) -> int:
         from mjx_drax.film import render_diffusion
 
         render_diffusion(solution, film, draw=draw, **look)
-    _report(solution)
-    say(f"written to {folder}/: {', '.join(written)}")
+    written += _write_exports(solution, folder, exports, tell)
+    for line in _report(solution):
+        tell(line)
+    tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:
-        say(f"film written to {film}")
+        tell(f"film written to {film}")
+    if options.json and not options.quiet:
+        print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
     return 0 if solution.certified else 1
 
 
@@ -304,6 +358,70 @@ def _video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any]) ->
     still = {name: look[name] for name in ("camera", "size") if name in look}
     render_timelapse(solution, folder / "timelapse.png", **still)
     return ["video.mp4", "timelapse.png"]
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    """NAME=VALUE in two."""
+    name, equals, value = text.partition("=")
+    if not (name.strip() and equals and value.strip()):
+        raise DraxError(f"--set {text!r}: give NAME=VALUE, such as attempts=3.")
+    return name.strip(), value.strip()
+
+
+def _export(options: argparse.Namespace) -> int:
+    exports = _exports(options)
+    if not exports:
+        flags = ", ".join(f"--{name}" for name in EXPORTS)
+        raise DraxError(f"nothing to write: give at least one of {flags}.")
+    from mjx_drax import results
+    from mjx_drax.solution import Solution
+
+    solution = Solution.load(options.folder)
+    _require_exports(solution.problem, exports)
+    folder = results.writable(options.folder)
+    written = _write_exports(solution, folder, exports, say)
+    say(f"written to {folder}/: {', '.join(written)}")
+    return 0
+
+
+def _exports(options: argparse.Namespace) -> list[str]:
+    """Names of the files that are asked for."""
+    return [name for name in EXPORTS if getattr(options, name)]
+
+
+def _require_exports(problem: Problem, exports: list[str]) -> None:
+    """Complain now about what could not be written later."""
+    from mjx_drax import browser, export, files
+
+    checks: dict[str, Callable[[], None]] = {
+        "html": lambda: browser.require_viewer(problem),
+        "keyframes": lambda: export.require_mjcf(problem),
+        "dataset": lambda: files.require("h5py", "dataset", "a dataset"),
+    }
+    for name in exports:
+        checks.get(name, lambda: None)()
+
+
+def _write_exports(
+    solution: Solution, folder: Path, exports: list[str], tell: Callable[[str], None]
+) -> list[str]:
+    """Write the files that are asked for; returns their names."""
+    from mjx_drax import browser, export
+
+    writers: dict[str, Callable[[Solution, Path], Path]] = {
+        "html": browser.save_html,
+        "csv": export.save_csv,
+        "keyframes": export.export_keyframes,
+        "dataset": export.save_dataset,
+    }
+    written = []
+    for name in exports:
+        if name == "dataset" and not solution.certified_chains.any():
+            tell("no chain is certified: dataset.h5 is left out")
+            continue
+        writers[name](solution, folder / EXPORTS[name][0])
+        written.append(EXPORTS[name][0])
+    return written
 
 
 def _benchmark(options: argparse.Namespace) -> int:
@@ -411,6 +529,7 @@ class _Bar:
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
+        self._best = float("inf")
 
     def __enter__(self) -> _Bar:
         return self
@@ -424,8 +543,9 @@ class _Bar:
         if self._bar is None:  # only now: before, it would count compilation as progress
             self._bar = tqdm(total=total, initial=done, file=sys.stderr, bar_format=self._FORMAT)
         feasible = np.asarray(info.max_defect) < FEASIBLE
-        best = np.asarray(info.cost)[feasible].min(initial=np.inf)
-        self._bar.set_postfix_str(f"best cost {best:.4g}, feasible {feasible.mean():.0%}", False)
+        self._best = np.asarray(info.cost)[feasible].min(initial=self._best)
+        numbers = f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
+        self._bar.set_postfix_str(numbers, False)
         self._bar.update(done - self._bar.n)
 
     def __exit__(self, *_: object) -> None:
@@ -435,25 +555,24 @@ class _Bar:
             self._bar.close()
 
 
-def _report(solution: Solution) -> None:
-    """The summary for a person."""
+def _report(solution: Solution) -> list[str]:
+    """The summary for a person, by lines."""
     from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK
 
     best, status = solution.best_chain, solution.status
     counts = ", ".join(f"{status.count(name)} {name}" for name in sorted(set(status)))
     rate = f"{solution.success_rate:.1%} succeed when replayed"
-    say(f"chains         {solution.chains}: {counts}; {rate}")
-    say(
+    times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
+    return [
+        f"chains         {solution.chains}: {counts}; {rate}",
         f"best           cost {solution.cost[best]:.5g}, max|h| {solution.max_defect[best]:.1e}, "
-        f"bound violation {solution.max_violation[best]:.1e}"
-    )
-    for mode in (OPEN_LOOP, WITH_FEEDBACK):
-        say(f"{mode:14} {solution.outcome(mode)}")
-    for line in _optima(solution):
-        say(line)
-    say(f"engine         {solution.certificate.engine}")
-    say(f"time           compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s")
-    say("CERTIFIED" if solution.certified else "NOT CERTIFIED: " + _advice(solution))
+        f"bound violation {solution.max_violation[best]:.1e}",
+        *(f"{mode:14} {solution.outcome(mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
+        *_optima(solution),
+        f"engine         {solution.certificate.engine}",
+        f"time           {times}",
+        "CERTIFIED" if solution.certified else "NOT CERTIFIED: " + _advice(solution),
+    ]
 
 
 def _optima(solution: Solution) -> list[str]:
@@ -484,6 +603,10 @@ def _advice(solution: Solution) -> str:
         "feasible chains miss the goal when replayed. Try more --chains, a higher weight on the "
         "terminal cost, or a longer --horizon."
     )
+
+
+def _silent(line: str) -> None:
+    """Keep a line from the user."""
 
 
 def say(line: str) -> None:

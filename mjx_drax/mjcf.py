@@ -41,6 +41,7 @@ from mjx_drax.problem import (
     vector,
 )
 from mjx_drax.scalar import scalarized
+from mjx_drax.source import Source, is_xml
 from mjx_drax.twin import driven, free_ranges, has_constraints, twin
 
 STEP_LIMIT = 2_000
@@ -52,11 +53,26 @@ class HostModel:
     """A `mujoco.MjModel` carried beside the numbers of a pytree.
 
     It takes no part in any compiled computation, so all of them compare equal: a model loaded
-    again does not recompile.
+    again does not recompile. `origin` is the MJCF that it was compiled from, if it was.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self.model = model
+    def __init__(self, model: mujoco.MjModel, origin: str | Path | Source | None = None) -> None:
+        self.model, self.origin = model, origin
+
+    def source(self) -> Source:
+        """The model's MJCF, with the files that it needs.
+
+        Raises:
+            DraxError: there is none, or it is no longer what the model was compiled from.
+        """
+        if isinstance(self.origin, Source):
+            return self.origin
+        if self.origin is None:
+            raise DraxError(
+                f"{model_name(self.model)} was given as a mujoco.MjModel, which cannot be written "
+                "as MJCF: give from_mjcf its file or its XML."
+            )
+        return Source.of(self.origin, self.model)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, HostModel)
@@ -198,6 +214,11 @@ class MjxDynamics(Dynamics):
         """Whether contacts, limits or dry friction act in f."""
         return has_constraints(self.model)
 
+    @property
+    def contacts(self) -> bool:
+        """Whether the plan knows contacts."""
+        return not int(self.model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+
     def differentiator(self, by: Any) -> Any:
         """Exact derivatives in scalar arithmetic; others as they are."""
         return InScalars(by) if isinstance(by, Autodiff) else by
@@ -317,7 +338,7 @@ def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
     if isinstance(source, mujoco.MjModel):
         return source
     try:
-        if isinstance(source, str) and source.lstrip().startswith("<"):
+        if is_xml(source):
             return mujoco.MjModel.from_xml_string(source)
         if not Path(source).is_file():
             raise DraxError(f"there is no model file {str(source)!r}: check the path.")
@@ -428,7 +449,7 @@ def from_mjcf(
     dynamics = MjxDynamics(
         twin(host, contacts, bounded),
         substeps * host.opt.timestep,
-        HostModel(host),
+        HostModel(host, _origin(model)),
         substeps,
         derivatives,
     )
@@ -451,6 +472,13 @@ def from_mjcf(
             horizon=knots(horizon, dynamics.dt),
         )
     )
+
+
+def _origin(model: str | Path | mujoco.MjModel) -> str | Path | None:
+    """The XML that the user gave, or its file's absolute path."""
+    if isinstance(model, mujoco.MjModel):
+        return None
+    return model if is_xml(model) else Path(model).resolve()
 
 
 def model_name(model: mujoco.MjModel) -> str:

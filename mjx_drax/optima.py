@@ -93,9 +93,7 @@ def distinct(solution: Solution, tolerance: float = TOLERANCE) -> tuple[Optimum,
     """
     if not (isinstance(tolerance, float | int | np.number) and tolerance > 0):
         raise DraxError(f"tolerance is {tolerance!r}: give a positive number, such as {TOLERANCE}.")
-    certified = np.flatnonzero(
-        solution.feasible & (solution.feedback.success | solution.open_loop.success)
-    )
+    certified = np.flatnonzero(solution.certified_chains)
     if not certified.size:
         return ()
     order = certified[np.argsort(solution.cost[certified], kind="stable")]
@@ -161,9 +159,7 @@ def _optimum(solution: Solution, members: np.ndarray) -> Optimum:
         share=len(members) / solution.chains,
         cost=float(solution.cost[chain]),
         max_defect=float(solution.max_defect[chain]),
-        certificate=Certificate(
-            solution.problem.dynamics.engine, open_loop.summary(chain), feedback.summary(chain)
-        ),
+        certificate=Certificate(solution.engine, open_loop.summary(chain), feedback.summary(chain)),
         trajectory=jax.tree.map(lambda a: a[chain], solution.trajectories),
         replayed=(replays.states[chain], replays.controls[chain]),
     )

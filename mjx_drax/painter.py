@@ -168,7 +168,9 @@ class Painter:
             shown = facing & np.all(depth > view.near, axis=1)
             depths.append(depth[shown].mean(axis=1))
             outlines.extend(view.to_pixels(camera[shown]) * _OVERSAMPLE)
-            colors.append(_shade(self._color(geom), geom, scene, view, middles, normals)[shown])
+            colors.append(
+                _shade(color(self._model, geom), geom, scene, view, middles, normals)[shown]
+            )
         if not outlines:
             return
         fills = np.concatenate(colors)
@@ -177,37 +179,48 @@ class Painter:
             fill = tuple(fills[index].tolist())
             draw.polygon(outlines[index].ravel().tolist(), fill=fill if fill[3] < 255 else fill[:3])
 
-    def _color(self, geom: mujoco.MjvGeom) -> Floats:
-        """The geom's rgba (4,), times the mean color of its texture if it has one."""
-        rgba = np.array(geom.rgba, float)
-        texture = _texture_id(self._model, geom.matid)
-        if texture >= 0:
-            rgba[:3] *= _texture(self._model, texture).mean(axis=(0, 1))
-        return rgba
-
     def _mesh(self, geom: mujoco.MjvGeom) -> Mesh | None:
         """The geom's surface in its own frame, or None for what this painter cannot draw."""
-        x, y, z = (float(value) for value in geom.size)
-        if geom.type in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID):
-            return _scaled(_capsule(0.0), (x, y, z))
-        if geom.type == _GEOM.mjGEOM_CAPSULE:
-            return _scaled(_capsule(round(z / x, 6)), (x, x, x))
-        if geom.type == _GEOM.mjGEOM_CYLINDER:
-            return _scaled(_prism(24), (x, y, z))
-        if geom.type in (_GEOM.mjGEOM_LINE, _GEOM.mjGEOM_ARROW, _GEOM.mjGEOM_ARROW1):
-            # MuJoCo's connectors run from their position along z, over the length in size[2]; the
-            # width of lines is in pixels.
-            line = geom.type == _GEOM.mjGEOM_LINE
-            half = 1e-3 * self._model.stat.extent * x if line else max(x, 1e-3)
-            return _shifted(_scaled(_prism(8), (half, half, z / 2.0)), z / 2.0)
-        if geom.type == _GEOM.mjGEOM_BOX:
-            return _scaled(_box(), (x, y, z))
         if geom.type == _GEOM.mjGEOM_MESH:
-            index = int(geom.dataid) // 2  # MuJoCo stores 2 * mesh, or 2 * mesh + 1 for its hull
+            index = mesh_of(geom)
             if index not in self._meshes:
-                self._meshes[index] = _model_mesh(self._model, index)
+                self._meshes[index] = _drawable(model_mesh(self._model, index))
             return self._meshes[index]
-        return None
+        return primitive(self._model, geom)
+
+
+def color(model: mujoco.MjModel, geom: mujoco.MjvGeom) -> Floats:
+    """The geom's rgba (4,), times the mean color of its texture if it has one."""
+    rgba = np.array(geom.rgba, float)
+    texture = _texture_id(model, geom.matid)
+    if texture >= 0:
+        rgba[:3] *= _texture(model, texture).mean(axis=(0, 1))
+    return rgba
+
+
+def mesh_of(geom: mujoco.MjvGeom) -> int:
+    """Which of the model's meshes a geom of a scene shows."""
+    return int(geom.dataid) // 2  # MuJoCo stores 2 * mesh, or 2 * mesh + 1 for its hull
+
+
+def primitive(model: mujoco.MjModel, geom: mujoco.MjvGeom) -> Mesh | None:
+    """The surface of a geom that is given by its size, in its own frame; None for others."""
+    x, y, z = (float(value) for value in geom.size)
+    if geom.type in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID):
+        return _scaled(_capsule(0.0), (x, y, z))
+    if geom.type == _GEOM.mjGEOM_CAPSULE:
+        return _scaled(_capsule(round(z / x, 6)), (x, x, x))
+    if geom.type == _GEOM.mjGEOM_CYLINDER:
+        return _scaled(_prism(24), (x, y, z))
+    if geom.type in (_GEOM.mjGEOM_LINE, _GEOM.mjGEOM_ARROW, _GEOM.mjGEOM_ARROW1):
+        # MuJoCo's connectors run from their position along z, over the length in size[2]; the
+        # width of lines is in pixels.
+        line = geom.type == _GEOM.mjGEOM_LINE
+        half = 1e-3 * model.stat.extent * x if line else max(x, 1e-3)
+        return _shifted(_scaled(_prism(8), (half, half, z / 2.0)), z / 2.0)
+    if geom.type == _GEOM.mjGEOM_BOX:
+        return _scaled(_box(), (x, y, z))
+    return None
 
 
 def _view(camera: mujoco.MjvGLCamera, height: int, width: int) -> View:
@@ -349,14 +362,19 @@ def _box() -> Mesh:
     return Mesh(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _model_mesh(model: mujoco.MjModel, index: int) -> Mesh:
-    """A mesh of the model, or its convex hull if it has too many faces to draw in time."""
+def model_mesh(model: mujoco.MjModel, index: int) -> Mesh:
+    """A mesh of the model."""
     start, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
     vertices = model.mesh_vert[start : start + count].astype(float)
     start, count = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
-    faces = model.mesh_face[start : start + count].astype(np.int64)
-    if count <= _MAX_MESH_FACES:
-        return Mesh(vertices, faces)
+    return Mesh(vertices, model.mesh_face[start : start + count].astype(np.int64))
+
+
+def _drawable(mesh: Mesh) -> Mesh:
+    """The mesh, or its convex hull if it has too many faces to draw in time."""
+    if len(mesh.faces) <= _MAX_MESH_FACES:
+        return mesh
+    vertices = mesh.vertices
     from scipy.spatial import ConvexHull  # slow to import, and seldom needed
 
     hull = ConvexHull(vertices)

@@ -1,10 +1,18 @@
-"""Result files: `result.json` for reading, `result.npz` for computing."""
+"""Result files: `result.json` for reading, `result.npz` for computing, both to load again.
+
+Functions are code and are not saved: a loaded solution has everything but costs, constraints, goal
+and, without an MJCF, dynamics (see `loading`).
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import os
 import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,9 +22,21 @@ import numpy as np
 
 from mjx_drax import __version__
 from mjx_drax.errors import DraxError
+from mjx_drax.files import complete
+from mjx_drax.mjcf import MjxDynamics
 from mjx_drax.optima import Optimum
 from mjx_drax.problem import Trajectory
+from mjx_drax.settings import to_data
 from mjx_drax.solution import Solution
+from mjx_drax.source import binary
+
+SUMMARY, ARRAYS = "result.json", "result.npz"
+
+FORMAT = 1
+"""Changes whenever files that were written before can no longer be loaded."""
+
+WHOLE = ("trajectories", "multipliers", "gains", "open_loop", "feedback")
+"""Attributes of a solution that are written for all chains, by their names."""
 
 OPTIMA = 32
 """So many of the distinct optima, cheapest first, go into result files."""
@@ -27,12 +47,16 @@ def summary(solution: Solution) -> dict[str, Any]:
     best, certificate = solution.best_chain, solution.certificate
     status = solution.status
     return {
+        "format": FORMAT,
         "task": solution.problem.name,
         "seed": solution.seed,
         "chains": solution.chains,
         "iterations": solution.iterations,
         "horizon": solution.problem.horizon,
         "dt": float(solution.problem.dynamics.dt),
+        "has_goal": solution.problem.goal is not None,
+        "contacts": getattr(solution.problem.dynamics, "contacts", None),
+        "settings": to_data(solution.solver),
         "compile_time_s": solution.compile_time,
         "solve_time_s": solution.solve_time,
         "best_chain": best,
@@ -66,6 +90,11 @@ def arrays(solution: Solution) -> dict[str, np.ndarray]:
     (records,) or (records, chains). Plans of the distinct optima in the order of `result.json`:
     optima_states (optima, K+1, nx), optima_controls (optima, K, nu); chain_optimum is the place in
     the order of all optima found, -1 for chains in none.
+
+    The whole solution, by the names of its attributes: solution.trajectories.x (chains, K, nx),
+    solution.gains, solution.open_loop.states, ..., problem.x_init, problem.bounds.u_lower, ... For
+    MJCF, model.binary is the compiled model, which only the same version of MuJoCo reads, and
+    model.xml its MJCF as MuJoCo writes it, with six digits; model.files/* are files it names.
     """
     best = solution.best_chain
     ways = np.array([optimum.chain for optimum in solution.optima[:OPTIMA]], int)
@@ -75,6 +104,7 @@ def arrays(solution: Solution) -> dict[str, np.ndarray]:
         optimum_of[optimum.members] = place
     replayed_states, replayed_controls = solution.replayed
     return {
+        **_whole(solution),
         "times": solution.problem.times,
         "states": np.asarray(solution.problem.with_start(solution.best)),
         "controls": np.asarray(solution.best.u),
@@ -111,19 +141,55 @@ def _answer(optimum: Optimum) -> dict[str, Any]:
     }
 
 
+def _whole(solution: Solution) -> dict[str, np.ndarray]:
+    """All that a solution holds, but what `arrays` names besides."""
+    problem = solution.problem
+    parts = {
+        **{f"solution.{name}": getattr(solution, name) for name in WHOLE},
+        "problem.x_init": problem.x_init,
+        "problem.bounds": problem.bounds,
+        "problem.scatter": problem.scatter,
+    }
+    found = {name: value for label, part in parts.items() for name, value in _flat(label, part)}
+    dynamics = problem.dynamics
+    if isinstance(dynamics, MjxDynamics):
+        found["model.binary"] = np.frombuffer(binary(dynamics.mj_model), np.uint8)
+        with contextlib.suppress(DraxError):  # without, only the same version can load it
+            source = dynamics.host.source()
+            found["model.xml"] = np.array(source.xml)
+            for name, content in source.assets.items():
+                found[f"model.files/{name}"] = np.frombuffer(content, np.uint8)
+    return found
+
+
+def _flat(label: str, part: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of nested dataclasses and tuples, named by their paths; None has none."""
+    if is_dataclass(part):
+        for f in fields(part):
+            yield from _flat(f"{label}.{f.name}", getattr(part, f.name))
+    elif isinstance(part, tuple):
+        for i, item in enumerate(part):
+            yield from _flat(f"{label}.{i}", item)
+    elif part is not None:
+        yield label, np.asarray(part)
+
+
 def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
     """Write result.json and result.npz into a folder, each at once or not at all.
+
+    `Solution.load` reads them again. result.json knows the digest of the result.npz that belongs to
+    it.
 
     Raises:
         DraxError: the folder cannot be written to.
     """
     folder = writable(folder)
-    partial = folder / ".result.partial.npz"
-    np.savez_compressed(partial, **arrays(solution))  # type: ignore[arg-type]
-    partial.replace(folder / "result.npz")
-    partial = folder / ".result.partial.json"
-    partial.write_text(json.dumps(summary(solution), indent=2) + "\n", encoding="utf-8")
-    partial.replace(folder / "result.json")
+    with complete(folder / ARRAYS) as partial:
+        np.savez_compressed(partial, **arrays(solution))  # type: ignore[arg-type]
+        digest = hashlib.sha256(partial.read_bytes()).hexdigest()
+    with complete(folder / SUMMARY) as partial:
+        text = json.dumps({**summary(solution), "npz_sha256": digest}, indent=2)
+        partial.write_text(text + "\n", encoding="utf-8")
     return folder
 
 

@@ -13,8 +13,10 @@ within `TRACKED` of the plan.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -103,6 +105,7 @@ class Solution:
             its noise ended (the same, if it had none).
         iterations: how many were done.
         compile_time, solve_time: [s].
+        engine: what replayed.
         recording: the chains' knots over the iterations, where `solve` was asked to record them.
     """
 
@@ -123,6 +126,7 @@ class Solution:
     iterations: int
     compile_time: float
     solve_time: float
+    engine: str
     recording: Recording | None = None
 
     @property
@@ -152,6 +156,11 @@ class Solution:
         return list(np.where(self.died_at >= 0, DIVERGED, names))
 
     @cached_property
+    def certified_chains(self) -> np.ndarray:
+        """Whether a chain is feasible and one of its replays succeeds, (chains,)."""
+        return self.feasible & (self.open_loop.success | self.feedback.success)
+
+    @cached_property
     def tracked(self) -> np.ndarray:
         """Whether a chain is feasible, and a replay of it succeeds and ends as planned, (chains,).
 
@@ -163,8 +172,7 @@ class Solution:
     @cached_property
     def best_chain(self) -> int:
         """The cheapest that is tracked, succeeds or is feasible; else the least infeasible."""
-        succeeds = self.feasible & (self.success | self.open_loop.success)
-        for eligible in (self.tracked, succeeds, self.feasible):
+        for eligible in (self.tracked, self.certified_chains, self.feasible):
             if eligible.any():
                 return int(np.argmin(np.where(eligible, self.cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
@@ -178,7 +186,7 @@ class Solution:
     def certificate(self) -> Certificate:
         """How the best chain replays."""
         return Certificate(
-            self.problem.dynamics.engine,
+            self.engine,
             self.open_loop.summary(self.best_chain),
             self.feedback.summary(self.best_chain),
         )
@@ -218,6 +226,49 @@ class Solution:
         """States (K+1, nx) and controls (K, nu) of the best chain, replayed in `replay_mode`."""
         replays = self.open_loop if self.replay_mode == OPEN_LOOP else self.feedback
         return replays.states[self.best_chain], replays.controls[self.best_chain]
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write `result.json` and `result.npz` into a folder, for `load`; see `results.save`.
+
+        Raises:
+            DraxError: the folder cannot be written to.
+        """
+        from mjx_drax.results import save
+
+        return save(self, folder)
+
+    @staticmethod
+    def load(folder: str | os.PathLike[str], problem: Problem | None = None) -> Solution:
+        """The solution that was saved into a folder, by `save` or by `mjx-drax solve`.
+
+        Args:
+            folder: that holds `result.json` and `result.npz`.
+            problem: what was solved. Functions are not saved, so without it the problem of the
+                solution has no costs, no constraints, no goal and, unless it came from MJCF, no
+                dynamics; plots, films, exports and optima need none of them, but to solve or
+                `certify` again does.
+
+        Raises:
+            DraxError: the files are missing, damaged or of another format, or the problem is not
+                the one that was solved.
+        """
+        from mjx_drax.loading import load
+
+        return load(folder, problem)
+
+    def certify(self) -> Solution:
+        """The same solution with every chain replayed again, by the engine that is here now.
+
+        Raises:
+            DraxError: it was loaded without its problem, whose cost and goal judge replays.
+        """
+        problem, plans = self.problem, self.trajectories
+        return replace(
+            self,
+            open_loop=_replays(problem, plans, np.zeros_like(self.gains)),
+            feedback=_replays(problem, plans, self.gains),
+            engine=problem.dynamics.engine,
+        )
 
 
 def solve(
@@ -294,6 +345,7 @@ def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Ru
         iterations=records[-1][0],
         compile_time=run.compile_time,
         solve_time=run.solve_time,
+        engine=problem.dynamics.engine,
     )
 
 

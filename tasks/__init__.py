@@ -27,11 +27,15 @@ def summary(name: str) -> str:
 
 
 def load(name: str) -> ModuleType:
-    """The module of a task.
+    """The module of a task, by its name or by a beginning that no other task has.
 
     Raises:
         DraxError: there is no such task; lists those there are.
     """
-    if name not in names():
-        raise DraxError(f"there is no task {name!r}: choose one of {', '.join(names())}.")
-    return import_module(f"{__name__}.{name}")
+    matching = [task for task in names() if task.startswith(name)]
+    if name in matching:
+        matching = [name]
+    if len(matching) != 1:
+        what = f"several tasks begin with {name!r}" if matching else f"there is no task {name!r}"
+        raise DraxError(f"{what}: choose one of {', '.join(matching or names())}.")
+    return import_module(f"{__name__}.{matching[0]}")

@@ -3,6 +3,7 @@
 Environment variables, so that the programs which the tests start have the same settings.
 """
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -15,6 +16,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import pytest  # noqa: E402
 
 # Again as configuration, in case a plugin of pytest imported jax before the lines above.
 for _option, _value in {
@@ -23,3 +26,84 @@ for _option, _value in {
     "jax_persistent_cache_min_entry_size_bytes": 0,
 }.items():
     jax.config.update(_option, _value)
+
+
+SLIDER = """
+<mujoco model="slider">
+  <compiler meshdir="meshes"/>
+  <option timestep="0.01" integrator="Euler"><flag contact="disable"/></option>
+  <asset>
+    <mesh name="wedge" file="wedge.obj"/>
+    <hfield name="hill" nrow="2" ncol="3" size="1 1 0.5 0.1" elevation="0 1 0  0 0.5 0"/>
+    <texture name="checks" type="2d" builtin="checker" rgb1="1 0 0" width="8" height="8"/>
+    <material name="checks" texture="checks"/>
+  </asset>
+  <worldbody>
+    <geom type="plane" size="2 2 0.1" pos="0 0 -0.5"/>
+    <geom type="hfield" hfield="hill" pos="0 3 -0.5"/>
+    <body name="cart"><joint name="slide" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+      <geom type="box" size="0.2 0.1 0.05" mass="1" rgba="0 0.5 0.5 1"/>
+      <geom type="cylinder" size="0.05 0.1" pos="0.2 0 0" mass="0.1" material="checks"/>
+      <geom type="ellipsoid" size="0.05 0.1 0.15" pos="-0.2 0 0.1" mass="0.1"/>
+      <geom type="mesh" mesh="wedge" pos="0 0 0.1" mass="0.1"/>
+      <geom type="capsule" size="0.02 0.1" pos="0 0.2 0" mass="0.1"/>
+      <geom type="sphere" size="0.05" pos="0 -0.2 0" mass="0.1"/>
+      <geom type="sphere" size="0.5" mass="0.1" rgba="1 1 1 0"/>
+      <site name="tip" pos="0 0 0.3" size="0.02"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="slide" gear="10" ctrlrange="-1 1" ctrllimited="true"/>
+  </actuator>
+  <keyframe><key name="home" qpos="0.05"/></keyframe>
+</mujoco>
+"""
+
+WEDGE = """
+v 0 0 0
+v 0.1 0 0
+v 0 0.1 0
+v 0 0 0.1
+f 1 3 2
+f 1 2 4
+f 1 4 3
+f 2 3 4
+"""
+
+
+@pytest.fixture(scope="session")
+def slider(tmp_path_factory):
+    """A solution from an MJCF file with all kinds of geoms: a cart comes to rest at 0.2."""
+    from mjx_drax import Langevin, from_mjcf, solve
+
+    folder = tmp_path_factory.mktemp("slider")
+    (folder / "meshes").mkdir()
+    (folder / "meshes" / "wedge.obj").write_text(WEDGE)
+    (folder / "slider.xml").write_text(SLIDER)
+    problem = from_mjcf(
+        folder / "slider.xml",
+        horizon=0.5,
+        terminal_residual=_at_rest,
+        running_residual=lambda data, u: 0.1 * u,
+        goal=lambda data: abs(data.qpos[0] - 0.2) < 0.01 and abs(data.qvel[0]) < 0.1,
+    )
+    return solve(problem, chains=4, solver=Langevin(iterations=30, tail=20))
+
+
+def _at_rest(data):
+    return jnp.concatenate([20.0 * (data.qpos - 0.2), 5.0 * data.qvel])
+
+
+@pytest.fixture
+def without(monkeypatch):
+    """without(package): as if it were not installed."""
+
+    def hide(package):
+        find = importlib.util.find_spec
+
+        def found(name, *rest):
+            return None if name == package else find(name, *rest)
+
+        monkeypatch.setattr(importlib.util, "find_spec", found)
+
+    return hide

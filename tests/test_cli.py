@@ -1,14 +1,17 @@
 """The command line, in this process; the heavy commands with the smallest sizes that still work."""
 
+import importlib.util
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mjx_drax import tasks
+from mjx_drax import DraxError, Geometric, Solution, cli, tasks
 from mjx_drax.cli import main
+from mjx_drax.restarts import CHUNK
 
 COST = """
 import jax.numpy as jnp
@@ -117,6 +120,80 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     assert "NOT CERTIFIED" in capsys.readouterr().out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]
     assert not (tmp_path / "video.mp4").exists()
+
+
+def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):
+    def interrupt(self, done, total, info):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli._Bar, "__call__", interrupt)
+    arguments = "solve pendulum --horizon 0.5 --chains 2 --iterations 400 --no-video"
+    assert main([*arguments.split(), "--out", str(tmp_path)]) == 1
+    assert "written to" in capsys.readouterr().out
+    assert Solution.load(tmp_path).iterations == CHUNK
+
+
+def test_ctrl_c_before_there_is_anything_to_save(monkeypatch, capsys):
+    def interrupt(options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_list", interrupt)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == "mjx-drax: interrupted\n"
+
+
+def test_settings_are_set_by_name(tmp_path, capsys):
+    short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video --quiet"
+    flags = ["--set", "attempts=1", "--set", "flow.noise=Geometric(3, 0.1)"]
+    main([*short.split(), *flags, "--out", str(tmp_path)])
+    assert capsys.readouterr() == ("", "")
+    solver = Solution.load(tmp_path).solver
+    assert (solver.attempts, solver.flow.noise) == (1, Geometric(3.0, 0.1))
+    assert "attempts, within" in error_of(capsys, *short.split(), "--set", "attempt=1")
+    assert "give NAME=VALUE" in error_of(capsys, *short.split(), "--set", "attempts")
+    assert "at least 1" in error_of(capsys, *short.split(), "--set", "attempts=0")
+
+
+def test_json_is_all_that_is_printed(slider, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("mjx_drax.solution.solve", lambda *_, **__: slider)
+    assert main(f"solve pendulum --no-video --json --out {tmp_path}".split()) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["task"] == "slider"
+    assert printed == json.loads((tmp_path / "result.json").read_text())
+
+
+def test_export_writes_what_is_asked_for(slider, tmp_path, capsys):
+    slider.save(tmp_path)
+    assert main(["export", str(tmp_path), "--csv", "--keyframes"]) == 0
+    assert "replay.csv, keyframes.xml" in capsys.readouterr().out
+    assert (tmp_path / "replay.csv").stat().st_size > 1000
+    assert (tmp_path / "keyframes.xml").stat().st_size > 1000
+    assert "--dataset" in error_of(capsys, "export", str(tmp_path))
+    assert "nowhere" in error_of(capsys, "export", str(tmp_path / "nowhere"), "--csv")
+
+
+def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, monkeypatch, without):
+    monkeypatch.setattr("mjx_drax.solution.solve", lambda *_, **__: pytest.fail("it was solved"))
+    assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--html")
+    assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--keyframes")
+    without("h5py")
+    assert "mjx-drax[dataset]" in error_of(capsys, "solve", "bug_trap", "--dataset")
+
+
+def test_a_dataset_without_certified_chains_is_left_out(slider, tmp_path, capsys):
+    replace(slider, max_defect=np.ones(4)).save(tmp_path)
+    if importlib.util.find_spec("h5py") is None:
+        pytest.skip("no h5py")
+    assert main(["export", str(tmp_path), "--csv", "--dataset"]) == 0
+    assert "no chain is certified: dataset.h5 is left out" in capsys.readouterr().out
+    assert not (tmp_path / "dataset.h5").exists()
+
+
+def test_tasks_go_by_their_beginnings():
+    assert tasks.load("cartp") is tasks.load("cartpole_swingup")
+    assert tasks.load("pendulum").__name__.endswith(".pendulum")
+    with pytest.raises(DraxError, match=r"several tasks begin with 'pend': .*pendulum_swingup"):
+        tasks.load("pend")
 
 
 def test_errors_name_cause_and_fix(own, capsys):

@@ -1,0 +1,151 @@
+"""What is handed on is what was replayed, under names that others know."""
+
+import csv
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError, export_keyframes, from_mjcf, mjcf, save_csv, save_dataset
+from mjx_drax.export import control_names, require_mjcf, state_names
+from mjx_drax.files import complete, require
+from mjx_drax.tasks import load
+
+SPACE = """
+<mujoco><worldbody>
+  <body><freejoint name="root"/><geom size="0.1"/>
+    <body><joint name="neck" type="ball"/><geom size="0.1"/>
+      <body><joint type="hinge"/><geom size="0.1"/></body>
+    </body>
+  </body>
+</worldbody>
+<actuator>
+  <motor name="push" joint="root" gear="1 0 0 0 0 0"/>
+  <general joint="root" gear="0 1 0 0 0 0" dyntype="integrator"/>
+</actuator></mujoco>
+"""
+
+
+def test_names_say_joint_and_actuator(slider):
+    model = mujoco.MjModel.from_xml_string(SPACE)
+    dynamics = type("Dynamics", (), {"mj_model": model, "nx": 27, "nu": 2})
+    names = state_names(dynamics)
+    assert names[:8] == [
+        *(f"qpos_root_{p}" for p in ("x", "y", "z", "qw", "qx", "qy", "qz")),
+        "qpos_neck_qw",
+    ]
+    assert names[11:14] == ["qpos_2", "qvel_root_vx", "qvel_root_vy"]
+    assert names[-5:] == ["qvel_neck_wx", "qvel_neck_wy", "qvel_neck_wz", "qvel_2", "act_1"]
+    assert len(names) == model.nq + model.nv + model.na
+    assert control_names(dynamics) == ["ctrl_push", "ctrl_1"]
+    trap = load("bug_trap").make().dynamics
+    assert (state_names(trap), control_names(trap)) == (["x0", "x1", "x2"], ["u0", "u1"])
+
+
+def test_a_table_has_a_row_for_every_knot(slider, tmp_path):
+    with save_csv(slider, tmp_path / "new" / "replay.csv").open() as file:
+        heading, *rows = csv.reader(file)
+    assert heading == ["time", "qpos_slide", "qvel_slide", "ctrl_push"]
+    states, controls = slider.replayed
+    np.testing.assert_array_equal(np.array([row[1:3] for row in rows], float), states)
+    np.testing.assert_array_equal(np.array([row[3:] for row in rows[:-1]], float), controls)
+    np.testing.assert_allclose([float(row[0]) for row in rows], slider.problem.times)
+    assert rows[-1][3] == ""
+
+
+def test_keyframes_hold_the_replay_and_the_model_finds_its_meshes(slider, tmp_path):
+    path = export_keyframes(slider, tmp_path / "elsewhere" / "keys.xml")
+    (tmp_path / "elsewhere").rename(tmp_path / "moved")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "moved" / path.name))
+    states, controls = slider.replayed
+    assert model.nkey == 1 + len(states)
+    assert [model.key(i).name for i in (0, 1, 26)] == ["home", "replay_0", "replay_25"]
+    np.testing.assert_allclose(model.key_qpos[1:], states[:, :1], rtol=1e-15)
+    np.testing.assert_allclose(model.key_qvel[1:], states[:, 1:], rtol=1e-15)
+    np.testing.assert_allclose(model.key_ctrl[1:-1], controls, rtol=1e-15)
+    np.testing.assert_allclose(model.key_time[1:], slider.problem.times)
+    before = slider.problem.dynamics.mj_model
+    np.testing.assert_allclose(model.mesh_vert, before.mesh_vert)
+    np.testing.assert_allclose(model.body_mass, before.body_mass, rtol=1e-5)
+
+
+def test_models_without_mjcf_have_no_keyframes(slider, tmp_path):
+    with pytest.raises(DraxError, match="bug_trap has no MuJoCo model to write keyframes of"):
+        require_mjcf(load("bug_trap").make())
+    dynamics = slider.problem.dynamics
+    unknown = replace(dynamics, host=mjcf.HostModel(dynamics.mj_model))
+    with pytest.raises(DraxError, match=r"was given as a mujoco\.MjModel"):
+        require_mjcf(replace(slider.problem, dynamics=unknown))
+    (tmp_path / "r.xml").write_text(SPACE)
+    problem = from_mjcf(tmp_path / "r.xml", horizon=0.1, running_residual=lambda data, u: u)
+    require_mjcf(problem)
+    (tmp_path / "r.xml").write_text(SPACE.replace("0.1", "0.2"))
+    with pytest.raises(DraxError, match=r"r.xml cannot be read again: it has changed since"):
+        require_mjcf(problem)
+    (tmp_path / "r.xml").unlink()
+    with pytest.raises(DraxError, match=r"r.xml cannot be read again"):
+        require_mjcf(problem)
+
+
+def test_a_dataset_holds_certified_trajectories_only(slider, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    died = replace(slider, max_defect=np.where(np.arange(4) == 1, 1.0, slider.max_defect))
+    path = save_dataset([slider, died], tmp_path / "data.h5")
+    with h5py.File(path) as file:
+        first, second = (file[name] for name in ("000_slider", "001_slider"))
+        assert file.attrs["format"] == 1
+        assert first.attrs["problem"] == "slider"
+        assert list(first.attrs["state_names"]) == ["qpos_slide", "qvel_slide"]
+        assert first["states"].shape == (4, 26, 2)
+        assert first["gains"].shape == (4, 25, 1, 2)
+        assert sorted(second["chain"]) == [0, 2, 3]
+        best = int(np.flatnonzero(first["chain"][:] == slider.best_chain)[0])
+        assert first["mode"].asstr()[best] == slider.replay_mode
+        np.testing.assert_array_equal(first["states"][best], slider.replayed[0])
+        np.testing.assert_array_equal(first["controls"][best], slider.replayed[1])
+        np.testing.assert_array_equal(first["plan_controls"][best], slider.best.u)
+        assert first["max_deviation"][best] == slider.certificate.open_loop["max_deviation"]
+        assert (np.diff(first["cost"]) >= 0).all()
+    hopeless = replace(slider, max_defect=np.ones(4))
+    with pytest.raises(DraxError, match="no chain is certified, so the dataset would be empty"):
+        save_dataset(hopeless, tmp_path / "none.h5")
+    assert not (tmp_path / "none.h5").exists()
+    with h5py.File(save_dataset(hopeless, tmp_path / "all.h5", everything=True)) as file:
+        assert not file["000_slider"]["feasible"][:].any()
+
+
+def test_extras_that_are_missing_are_named(slider, tmp_path, without):
+    without("h5py")
+    with pytest.raises(DraxError, match=r'a dataset needs h5py.*pip install "mjx-drax\[dataset\]"'):
+        save_dataset(slider, tmp_path / "data.h5")
+    require("numpy", "x", "nothing")
+
+
+def test_paths_that_are_refused(slider, tmp_path):
+    with pytest.raises(DraxError, match=r"'replay.txt' does not end in .csv: rename it"):
+        save_csv(slider, tmp_path / "replay.txt")
+    (tmp_path / "folder.csv").mkdir()
+    with pytest.raises(DraxError, match="it is a folder"):
+        save_csv(slider, tmp_path / "folder.csv")
+    (tmp_path / "file").touch()
+    with pytest.raises(DraxError, match=r"cannot write .*Choose another place"):
+        save_csv(slider, tmp_path / "file" / "replay.csv")
+
+
+def test_a_file_appears_once_it_is_complete(tmp_path):
+    target = tmp_path / "file.txt"
+    target.write_text("old")
+
+    def fail():
+        with complete(target) as partial:
+            partial.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
+    assert target.read_text() == "old"
+    with complete(target) as partial:
+        partial.write_text("new")
+    assert target.read_text() == "new"

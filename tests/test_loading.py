@@ -1,0 +1,185 @@
+"""Solutions come back from their files with all that they were, or are refused with a reason."""
+
+import json
+import shutil
+from dataclasses import fields, replace
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import (
+    DraxError,
+    Geometric,
+    Identity,
+    Langevin,
+    Solution,
+    from_function,
+    loading,
+    mjcf,
+    render,
+    results,
+    solve,
+)
+from mjx_drax.errors import DraxWarning
+from mjx_drax.plotting import plot_solution
+
+
+@pytest.fixture(scope="module")
+def point():
+    """A solution of a problem with a function, an inequality and no goal."""
+    problem = from_function(
+        lambda x, u: x + 0.1 * u,
+        x_init=[0.0],
+        nu=1,
+        dt=0.1,
+        horizon=0.5,
+        running_residual=lambda x, u: u,
+        terminal_residual=lambda x: 10.0 * (x - 1.0),
+        inequality=lambda x, u: u - 3.0,
+        u_bounds=(-5.0, 5.0),
+        name="point",
+    )
+    return solve(problem, chains=3, solver=Langevin(iterations=10, tail=20))
+
+
+@pytest.fixture
+def folder(slider, tmp_path):
+    return slider.save(tmp_path / "result")
+
+
+def everything(solution):
+    """Every array and number of a solution, but the problem."""
+    parts = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name != "problem"}
+    parts |= {mode: vars(parts[mode]) for mode in ("open_loop", "feedback")}
+    return parts
+
+
+@pytest.mark.parametrize("name", ["slider", "point"])
+def test_all_comes_back(name, request, tmp_path):
+    solution = request.getfixturevalue(name)
+    solution.save(tmp_path)
+    again = Solution.load(tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, everything(again), everything(solution))
+    kinds = [jax.tree.map(lambda a: np.asarray(a).dtype, s.trajectories) for s in (again, solution)]
+    assert kinds[0] == kinds[1]
+    for said in ("certificate", "certified", "best_chain", "status", "replay_mode", "success_rate"):
+        assert getattr(again, said) == getattr(solution, said)
+    for mode in ("open loop", "with feedback"):
+        assert again.outcome(mode) == solution.outcome(mode)
+    assert len(again.optima) == len(solution.optima)
+    np.testing.assert_array_equal(again.problem.times, solution.problem.times)
+    np.testing.assert_array_equal(again.problem.x_init, solution.problem.x_init)
+    plot_solution(again, tmp_path / "plot.png")
+    assert again.save(tmp_path / "again").is_dir()
+    np.testing.assert_array_equal(
+        Solution.load(tmp_path / "again").feedback.states, solution.feedback.states
+    )
+
+
+def test_a_model_comes_back_and_can_be_filmed(slider, folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "elsewhere")
+    again = Solution.load(tmp_path / "elsewhere")
+    model, before = (s.problem.dynamics.mj_model for s in (again, slider))
+    np.testing.assert_array_equal(model.mesh_vert, before.mesh_vert)
+    assert again.problem.dynamics.host.source() == slider.problem.dynamics.host.source()
+    assert again.problem.dynamics.contacts == slider.problem.dynamics.contacts
+    assert render(again, tmp_path / "film.mp4", fps=2, size=(64, 64)).stat().st_size > 500
+
+
+def test_functions_are_missing_until_the_problem_is_given(slider, folder):
+    again = Solution.load(folder)
+    for needs in (again.certify, lambda: solve(again.problem, chains=1)):
+        with pytest.raises(DraxError, match="is code, which is not saved: load the solution with"):
+            needs()
+    certified = Solution.load(folder, slider.problem).certify()
+    assert certified.certificate == slider.certificate
+
+
+def test_another_problem_is_refused(slider, folder):
+    problem = slider.problem
+    for other, words in (
+        (replace(problem, horizon=24), "has K = 24, the saved solution of slider has 25"),
+        (problem.with_x_init([0.1, 0.0]), r"x_init of the problem slider is \[0.1"),
+    ):
+        with pytest.raises(DraxError, match=words):
+            Solution.load(folder, other)
+
+
+def rewritten(folder, **changes):
+    path = folder / "result.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def test_files_that_are_refused(folder, tmp_path):
+    with pytest.raises(DraxError, match=r"cannot read .*nowhere.*result.json"):
+        Solution.load(tmp_path / "nowhere")
+    rewritten(folder, format=7)
+    with pytest.raises(
+        DraxError, match=r"has format 7 .* this version reads format 1: solve again"
+    ):
+        Solution.load(folder)
+    rewritten(folder, format=None)
+    with pytest.raises(DraxError, match="has no format number"):
+        Solution.load(folder)
+    rewritten(folder, format=1, settings={"part": "Nonsense"})
+    with pytest.raises(DraxError, match="Another version of mjx_drax wrote them"):
+        Solution.load(folder)
+    rewritten(folder, settings=None, certificate={})
+    with pytest.raises(DraxError, match="is damaged"):
+        Solution.load(folder)
+    (folder / "result.json").write_text("{")
+    with pytest.raises(DraxError, match="is damaged, it is no JSON object"):
+        Solution.load(folder)
+    (folder / "result.json").write_text("[1]")
+    with pytest.raises(DraxError, match="is damaged, it is no JSON object"):
+        Solution.load(folder)
+
+
+@pytest.mark.parametrize("keep", [0, 100, -1])
+def test_truncated_arrays_are_refused(folder, keep):
+    content = (folder / "result.npz").read_bytes()
+    (folder / "result.npz").write_bytes(content[:keep])
+    with pytest.raises(DraxError, match=r"result.npz' does not belong to result.json"):
+        Solution.load(folder)
+    (folder / "result.npz").unlink()
+    with pytest.raises(DraxError, match=r"cannot read .*result.npz"):
+        Solution.load(folder)
+
+
+def test_an_interrupted_save_leaves_what_was_there(slider, folder, monkeypatch):
+    def fail(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(results.np, "savez_compressed", fail)
+    with pytest.raises(KeyboardInterrupt):
+        slider.save(folder)
+    assert sorted(p.name for p in folder.iterdir()) == ["result.json", "result.npz"]
+    assert Solution.load(folder).certified
+
+
+def test_another_version_of_mujoco_compiles_the_mjcf_again(slider, folder, monkeypatch):
+    versions = json.loads((folder / "result.json").read_text())["versions"]
+    rewritten(folder, versions={**versions, "mujoco": "3.0.0"})
+    with pytest.warns(DraxWarning, match=r"saved by MuJoCo 3.0.0"):
+        again = Solution.load(folder)
+    np.testing.assert_allclose(
+        again.problem.dynamics.mj_model.body_mass,
+        slider.problem.dynamics.mj_model.body_mass,
+        rtol=1e-5,
+    )
+    dynamics = slider.problem.dynamics
+    unknown = replace(dynamics, host=mjcf.HostModel(dynamics.mj_model))
+    replace(slider, problem=replace(slider.problem, dynamics=unknown)).save(folder)
+    assert Solution.load(folder).certified
+    rewritten(folder, versions={**versions, "mujoco": "3.0.0"})
+    with pytest.raises(DraxError, match=r"MuJoCo 3.0.0 without MJCF.* pip install mujoco==3.0.0"):
+        Solution.load(folder)
+
+
+def test_other_settings_come_back(slider, tmp_path):
+    solver = Langevin(noise=Geometric(np.float32(3.0), 1e-3), preconditioner=Identity())
+    replace(slider, solver=solver).save(tmp_path)
+    assert loading.load(tmp_path).solver == solver
+    assert mujoco.__version__ in Solution.load(tmp_path).certificate.engine

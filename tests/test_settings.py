@@ -1,0 +1,81 @@
+"""Settings by name: what can be set, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from mjx_drax import Constant, DraxError, Geometric, Identity, Langevin, Restarts, Smoothed
+from mjx_drax.settings import changed, from_data, names, to_data
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("attempts", "3", 3),
+        ("descent", "None", None),
+        ("within", "2", 2.0),
+        ("flow.iterations", "20", 20),
+        ("flow.adjusted", "True", True),
+        ("flow.noise", "0.5", Constant(0.5)),
+        ("flow.noise", "Geometric(3, 0.1)", Geometric(3.0, 0.1)),
+        ("flow.noise", "3, 0.1, 0", Geometric(3.0, 0.1, 0.0)),
+        ("flow.noise.start", "7", 7.0),
+        ("flow.preconditioner", "Identity", Identity()),
+        ("flow.preconditioner.derivatives", "Smoothed()", Smoothed()),
+    ],
+)
+def test_one_setting_changes_and_no_other(name, text, value):
+    new = changed(Restarts(), name, text)
+    seen, old = new, Restarts()
+    for part in name.split("."):
+        seen, old = getattr(seen, part), getattr(old, part)
+    assert (seen, type(seen)) == (value, type(value))
+    here, before = ({n: repr(n) for n in names(s)} for s in (new, Restarts()))
+    assert set(before) - set(here) <= {n for n in before if n.startswith(f"{name}.")}
+    back = new
+    if "." in name and name.count(".") == 1:
+        back = replace(new, flow=replace(new.flow, **{name.split(".")[1]: old}))
+        assert back == Restarts()
+
+
+def test_an_end_that_was_final_stays_so():
+    assert changed(Restarts(), "flow.noise.end", "0.1").flow.noise == Geometric(6.0, 0.1)
+    assert changed(Restarts(), "flow.damping.end", "0.2").flow.damping.final == 0.03
+    assert changed(Langevin(), "noise.end", "0.1").noise.final == 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        (
+            "attempt",
+            "3",
+            r"there is no setting 'attempt': choose one of flow.iterations, .*attempts",
+        ),
+        ("flow", "3", "there is no setting 'flow'"),
+        ("attempts", "2.5", "attempts is '2.5': give a whole number; it was 5"),
+        ("attempts", "True", "give a whole number"),
+        ("attempts", "many", "give a whole number"),
+        ("within", "nan", "give a number"),
+        ("descent", "x", "give a whole number or None"),
+        ("flow.adjusted", "1", "give True or False"),
+        ("flow.noise", "hot", r"give a number, Geometric\(start, end\)"),
+        ("flow.noise.start", "hot", "give a number"),
+        ("flow.preconditioner", "Newton", "give one of Diagonal, GaussNewton, Identity, LBFGS"),
+    ],
+)
+def test_what_is_refused(name, text, words):
+    with pytest.raises(DraxError, match=words):
+        changed(Restarts(), name, text)
+
+
+@pytest.mark.parametrize(
+    "solver", [Restarts(), Langevin(preconditioner=Identity(), noise=Constant(0.2))]
+)
+def test_there_and_back(solver):
+    assert from_data(json.loads(json.dumps(to_data(solver)))) == solver
+
+
+def test_what_is_not_ours_is_kept_as_text():
+    assert to_data(Langevin(noise=len))["noise"] == repr(len)
