@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mjx_drax import guesses as guesses
+    from mjx_drax.batch import BatchSolution as BatchSolution
+    from mjx_drax.batch import solve_batch as solve_batch
     from mjx_drax.bounds import LogBarrier as LogBarrier
     from mjx_drax.bounds import Projection as Projection
     from mjx_drax.bounds import Reflection as Reflection
@@ -49,6 +51,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "BatchSolution": "batch",
+    "solve_batch": "batch",
     "LogBarrier": "bounds",
     "DraxError": "errors",
     "export_keyframes": "export",

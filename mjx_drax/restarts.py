@@ -240,7 +240,9 @@ class _Search:
         self.records.append((0, info))
         kept, complete = self._attempt(first, state, info, np.arange(self.chains), total)
         for attempt in range(1, solver.attempts):
-            left = np.flatnonzero(~_finished(kept, solver.within, unit))
+            left = np.flatnonzero(
+                ~finished(np.asarray(kept.info.cost), kept.feasible, solver.within, unit)
+            )
             if not complete or len(left) <= (1.0 - enough) * self.chains:
                 break
             owners = np.resize(left, self.chains)
@@ -249,7 +251,12 @@ class _Search:
             if kinked:
                 flow = solver.first(unit)
             elif solver.descent is not None:
-                flow = replace(flow, scale=_scale(unit, np.sqrt(_level(kept, unit))))
+                flow = replace(
+                    flow,
+                    scale=_scale(
+                        unit, np.sqrt(level(np.asarray(kept.info.cost), kept.feasible, unit))
+                    ),
+                )
             try:
                 found, complete = self._attempt(flow, *self._start(flow, attempt), owners, total)
                 kept = _best(kept, found, owners)
@@ -397,20 +404,19 @@ def unit_of(costs: np.ndarray) -> float:
     return UNIT * _median(costs) or 1.0
 
 
-def _level(kept: Attempt, unit: float) -> float:
+def level(costs: np.ndarray, feasible: np.ndarray, unit: float) -> float:
     """The scale of the costs of answers: the best so far, or what all have if none is feasible."""
-    costs = np.asarray(kept.info.cost)
-    level = abs(costs[kept.feasible].min()) if kept.feasible.any() else _median(costs)
-    return max(float(level), NEGLIGIBLE * unit)
+    scale = abs(costs[feasible].min()) if feasible.any() else _median(costs)
+    return max(float(scale), NEGLIGIBLE * unit)
 
 
-def _finished(kept: Attempt, within: float, unit: float) -> np.ndarray:
-    """Which chains are done, (chains,)."""
-    costs = np.where(kept.feasible, np.asarray(kept.info.cost), np.inf)
-    best = costs.min()
-    if not np.isfinite(best):
-        return kept.feasible
-    return costs <= best + max(within * abs(best), NEGLIGIBLE * unit)
+def finished(costs: np.ndarray, feasible: np.ndarray, within: float, unit: ArrayLike) -> np.ndarray:
+    """Which chains are done, (..., chains), for one problem or several with units (...,)."""
+    costs = np.where(feasible, costs, np.inf)
+    best = costs.min(axis=-1, keepdims=True)
+    known = np.isfinite(best)
+    margin = np.maximum(within * np.abs(best), NEGLIGIBLE * np.expand_dims(unit, -1))
+    return np.where(known, costs <= best + np.where(known, margin, 0.0), feasible)
 
 
 def _improved(kept: Attempt, found: Attempt) -> np.ndarray:

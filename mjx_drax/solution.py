@@ -14,8 +14,9 @@ within `TRACKED` of the plan.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Langevin, evaluate, feedback_gains
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, evaluate, feedback_gains
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
 from mjx_drax.recording import Recorder, Recording
@@ -350,15 +351,32 @@ def _certified(problem: Problem, solver: Langevin | Restarts, seed: int, run: Ru
 
 
 def _replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> Replays:
-    """Replay every chain's controls with the given gains, and judge where they end."""
-    chains = len(gains)
+    """Every chain's controls, applied from x_0 with the given feedback gains."""
     plan = np.asarray(problem.with_start(trajectories), float)
-    states, controls = problem.replay(plan, trajectories.u, gains)
+    ran = problem.replay(plan, trajectories.u, gains)
+    return judged(problem, plan, ran, partial(evaluate, problem))
+
+
+def judged(
+    problem: Problem,
+    plan: np.ndarray,
+    ran: tuple[np.ndarray, np.ndarray],
+    evaluated: Callable[[Trajectory], Info],
+) -> Replays:
+    """What replays are worth.
+
+    Args:
+        problem: for its goal, its state arithmetic and its precision.
+        plan: planned states x_0..x_K, (runs, K + 1, nx).
+        ran: replayed states, of the same shape, and the controls that were applied (runs, K, nu).
+        evaluated: gives cost and bound violation of a batch of trajectories.
+    """
+    states, controls = ran
     off = np.nan_to_num(problem.dynamics.deviation(states, plan), nan=np.inf)
     dtype = problem.x_init.dtype
-    replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
-    info = evaluate(problem, replayed)
-    reached = [_reached(problem, states[c, -1], off[c, -1]) for c in range(chains)]
+    info = evaluated(Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype)))
+    ends = zip(states[:, -1], off[:, -1], strict=True)
+    reached = [_reached(problem, x, deviation) for x, deviation in ends]
     violation = np.nan_to_num(np.asarray(info.max_violation), nan=np.inf)
     return Replays(
         states=states,

@@ -1,0 +1,411 @@
+"""Many problems at once: problems x chains is the batch axis of one compiled solve.
+
+`solve_batch` runs `Restarts` on every problem of a family, all in step. Each problem keeps its own
+units, random numbers and attempts, so its answer does not depend on which others are solved beside
+it. Problems that are done leave the batch; the rest is packed into chunks of one size, which one
+compilation serves and which fit into memory.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.errors import DraxError
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate
+from mjx_drax.problem import Problem, Trajectory, checked
+from mjx_drax.restarts import MORE, Restarts, finished, initial_knots, level, unit_of
+from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Replays, judged
+
+SHARE = 0.5
+"""Share of the memory that is free which a chunk may take."""
+
+COPIES = 40
+"""Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Problems that differ in some of their numbers.
+
+    Attributes:
+        problem: all of them; leaves that differ have a leading axis (N, ...).
+        differs: which leaves, in the order of `jax.tree.leaves`.
+        count: N.
+    """
+
+    problem: Problem
+    differs: tuple[bool, ...]
+    count: int
+
+    @classmethod
+    def of(cls, make: Callable[[Any], Problem], values: Any) -> Family:
+        """The problems make(value) for values stacked along the first axis of every leaf.
+
+        Raises:
+            DraxError: leaves of `values` without a common first axis, or a misfit in the first
+                problem.
+        """
+        counts = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
+        if len(counts) != 1 or not min(counts) or min(counts)[0] < 1:
+            raise DraxError(
+                f"values have first axes {sorted(counts)}: stack one entry for each problem along "
+                "the first axis of every array."
+            )
+        count = min(counts)[0]
+
+        def nth(i: int) -> Problem:
+            return make(jax.tree.map(lambda leaf: leaf[i], values))
+
+        first, last = checked(nth(0)), nth(count - 1)
+        leaves, others = jax.tree.leaves(first), jax.tree.leaves(last)
+        if count == 1:  # nothing to compare with: what a second make leaves as it is, is shared
+            others = jax.tree.leaves(nth(0))
+        if len(leaves) != len(others):
+            raise DraxError("make gives problems of different structure: vary numbers only.")
+        differs = tuple(a is not b for a, b in zip(leaves, others, strict=True))
+        tree: list[Any] = []
+
+        @jax.jit
+        @jax.vmap
+        def differing(value: Any) -> list[Array]:
+            found, structure = jax.tree.flatten(make(value))
+            tree.append(structure)
+            return [jnp.asarray(a) for a, d in zip(found, differs, strict=True) if d]
+
+        stacked = iter(differing(jax.tree.map(jnp.asarray, values)))
+        merged = [next(stacked) if d else a for a, d in zip(leaves, differs, strict=True)]
+        family = cls(jax.tree.unflatten(tree[0], merged), differs, count)
+        if family.varies("dynamics") and hasattr(first.dynamics, "mj_model"):
+            raise DraxError(
+                f"make changes the dynamics of {first.name}, and the C engine would "
+                "replay another: solve for each model by itself."
+            )
+        return family
+
+    def _each(self, change: Callable[[Any], Any]) -> Problem:
+        """The problem with another value for each leaf that differs."""
+        leaves, tree = jax.tree.flatten(self.problem)
+        new = [change(a) if d else a for a, d in zip(leaves, self.differs, strict=True)]
+        return jax.tree.unflatten(tree, new)
+
+    def varies(self, *names: str) -> bool:
+        """Whether any number in those attributes of the problem differs."""
+        tree = jax.tree.structure(self.problem)
+        differs = jax.tree.unflatten(tree, self.differs)
+        return any(any(jax.tree.leaves(getattr(differs, name))) for name in names)
+
+    def at(self, i: int) -> Problem:
+        """One of the problems."""
+        return self._each(lambda leaf: leaf[i])
+
+    def some(self, indices: np.ndarray) -> Family:
+        """Those problems, in that order."""
+        return replace(self, problem=self._each(lambda leaf: leaf[indices]), count=len(indices))
+
+    def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """function(problem, ...) over all problems, and over the first axis of what follows."""
+        tree = jax.tree.structure(self.problem)
+        axes = jax.tree.unflatten(tree, [0 if d else None for d in self.differs])
+
+        def mapped(problem: Problem, *arguments: Any) -> Any:
+            return jax.vmap(function, in_axes=(axes, *[0] * len(arguments)))(problem, *arguments)
+
+        return mapped
+
+
+jax.tree_util.register_dataclass(Family, data_fields=["problem"], meta_fields=["differs", "count"])
+
+
+@dataclass(frozen=True)
+class BatchSolution:
+    """The best chain of every problem, certified.
+
+    Attributes:
+        family: the problems; `family.at(i)` is one of them.
+        x: states x_0..x_K, (N, K + 1, nx).
+        u: controls, (N, K, nu).
+        gains: feedback (N, K, nu, ndx).
+        chain_cost, chain_defect: cost and max|h| of all chains, (N, chains).
+        best: which chain is in x and u, (N,).
+        open_loop, feedback: replays of the best chains, over problems.
+        compile_time, solve_time, replay_time: [s].
+    """
+
+    family: Family
+    x: np.ndarray
+    u: np.ndarray
+    gains: np.ndarray
+    chain_cost: np.ndarray
+    chain_defect: np.ndarray
+    best: np.ndarray
+    open_loop: Replays
+    feedback: Replays
+    compile_time: float
+    solve_time: float
+    replay_time: float
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Of the best chains, (N,)."""
+        return np.take_along_axis(self.chain_cost, self.best[:, None], 1)[:, 0]
+
+    @property
+    def max_defect(self) -> np.ndarray:
+        """max|h| of the best chains, (N,)."""
+        return np.take_along_axis(self.chain_defect, self.best[:, None], 1)[:, 0]
+
+    @property
+    def feasible(self) -> np.ndarray:
+        """Whether max|h| < `FEASIBLE`, (N,)."""
+        return self.max_defect < FEASIBLE
+
+    @property
+    def certified(self) -> np.ndarray:
+        """Whether the plan is feasible and one of its replays succeeds, (N,)."""
+        return self.feasible & (self.open_loop.success | self.feedback.success)
+
+    @property
+    def replay_modes(self) -> list[str]:
+        """How each is to be replayed: open loop where that succeeds."""
+        return [OPEN_LOOP if ok else WITH_FEEDBACK for ok in self.open_loop.success]
+
+
+def solve_batch(
+    make: Callable[[Any], Problem],
+    values: Any,
+    chains: int = 16,
+    seed: int = 0,
+    solver: Langevin | Restarts | None = None,
+    chunk: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> BatchSolution:
+    """Solve the problems make(value), for thousands of values.
+
+        solve_batch(lambda x: dataclasses.replace(problem, x_init=x), states)
+
+    Args:
+        make: gives a problem for one value; it is traced, so it may change any number of a problem
+            (initial state, bounds, bound arguments of a cost or of a function's dynamics).
+        values: arrays, or a pytree of them, with one entry for each problem along the first axis.
+        chains: for each problem.
+        seed: of all random numbers; problem i gets the same ones whatever is solved beside it.
+        solver: `Restarts()` by default.
+        chunk: problems that are solved at a time; None: as many as half of the free memory holds.
+        progress: called with (problems done, of how many) after every chunk.
+
+    Where f has kinks (contacts), chains are not led on along replays as `solve` does.
+
+    Raises:
+        DraxError: as `solve`; values without a common first axis; a model that varies, which the C
+            engine would not replay.
+    """
+    solver = solver or Restarts()
+    if not isinstance(chains, int | np.integer) or chains < 1:
+        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
+    family = Family.of(make, values)
+    solver.check(family.at(0))
+    if isinstance(solver, Langevin):
+        solver = Restarts(solver, descent=None, attempts=1)
+    size = min(chunk or fitting(family.at(0), chains), family.count)
+    if size < 1:
+        raise DraxError(f"chunk is {chunk!r}: give a whole number of at least 1.")
+    search = _Search(family, int(chains), seed, solver, size)
+    clock = time.perf_counter()
+    search.run(progress)
+    return search.solution(time.perf_counter() - clock - search.compile_time)
+
+
+def fitting(problem: Problem, chains: int) -> int:
+    """How many problems may be solved at a time, for the memory that is free now."""
+    device = jax.devices()[0]
+    stats = device.memory_stats() or {}
+    if "bytes_limit" in stats:
+        free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    else:
+        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    width = problem.dynamics.ndx + problem.dynamics.nu
+    each = COPIES * chains * problem.horizon * width**2 * problem.x_init.dtype.itemsize
+    return max(1, int(SHARE * free // each))
+
+
+class _Search:
+    """The attempts of a batch; what is kept of every chain is on the host."""
+
+    def __init__(self, family: Family, chains: int, seed: int, solver: Restarts, size: int) -> None:
+        self.family, self.chains, self.seed = family, chains, seed
+        self.solver, self.size = solver, size
+        self.compile_time = 0.0
+        problem, shape = family.problem, (family.count, chains)
+        K, dynamics = problem.horizon, problem.dynamics
+        dtype = problem.x_init.dtype
+        self.x = np.zeros((*shape, K, dynamics.nx), dtype)
+        self.u = np.zeros((*shape, K, dynamics.nu), dtype)
+        self.gains = np.zeros((*shape, K, dynamics.nu, dynamics.ndx), dtype)
+        self.cost, self.defect = np.full(shape, np.inf), np.full(shape, np.inf)
+        self.unit = np.ones(family.count)
+
+    def finished(self, indices: np.ndarray) -> np.ndarray:
+        """Which chains of those problems are done, (len(indices), chains)."""
+        feasible = self.defect[indices] < FEASIBLE
+        return finished(self.cost[indices], feasible, self.solver.within, self.unit[indices])
+
+    def run(self, progress: Callable[[int, int], None] | None) -> None:
+        """All attempts; Ctrl-C keeps what there is."""
+        everyone = todo = np.arange(self.family.count)
+        try:
+            for attempt in range(self.solver.attempts):
+                for start in range(0, len(todo), self.size):
+                    part = todo[start : start + self.size]
+                    self._chunk(np.resize(part, self.size), len(part), attempt)
+                    if progress is not None:
+                        progress(len(everyone) - len(todo) + start + len(part), len(everyone))
+                todo = everyone[self.finished(everyone).mean(axis=1) < self.solver.enough]
+                self.unit[(self.defect >= FEASIBLE).all(axis=1)] *= MORE
+        except KeyboardInterrupt:
+            if not self.compile_time:
+                raise
+
+    def _chunk(self, indices: np.ndarray, count: int, attempt: int) -> None:
+        """One attempt on some problems; those after the first `count` fill up the chunk."""
+        clock, solver, some = time.perf_counter(), self.solver, self.family.some(indices)
+        key = jax.random.fold_in(jax.random.key(self.seed), attempt)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(indices))
+        knots = some.over(partial(_drawn, self.chains))(some.problem, keys)
+        if solver.descent is None:
+            flow, scale = solver.flow, solver.flow.scale
+            cost, noise = (np.broadcast_to(s, len(indices)) for s in (scale.cost, scale.noise))
+        elif attempt == 0:
+            flow = solver.first(1.0)
+            costs = np.asarray(_evaluated(some, knots).cost)
+            self.unit[indices] = [unit_of(row) for row in costs]
+            cost, noise = self.unit[indices], np.zeros(len(indices))
+        else:
+            flow, cost = solver.flow, self.unit[indices]
+            feasible = self.defect[indices] < FEASIBLE
+            rows = zip(self.cost[indices], feasible, cost, strict=True)
+            noise = np.sqrt([level(*row) for row in rows])
+        scales = Scale(jnp.asarray(cost, knots.x.dtype), jnp.asarray(noise, knots.x.dtype))
+        total, tail = int(flow.iterations + flow.tail), int(flow.tail) > 0
+        if not self.compile_time:
+            jax.block_until_ready(_flowed(flow, some, scales, knots, keys, 0, tail))
+            self.compile_time = time.perf_counter() - clock
+        found = _flowed(flow, some, scales, knots, keys, total, tail)
+        self._keep(indices[:count], *jax.tree.map(lambda a: np.asarray(a)[:count], found))
+
+    def _keep(self, indices: np.ndarray, knots: Trajectory, gains: np.ndarray, info: Info) -> None:
+        """Every chain takes the best of what it has and of what was found for it.
+
+        Chains that are done leave their places in the batch to those that are not, as in
+        `restarts`: each place works for one chain that was not done.
+        """
+        done = self.finished(indices)
+        owners = np.stack(
+            [np.resize(np.flatnonzero(~row) if not row.all() else [0], len(row)) for row in done]
+        )
+        found_cost, found_defect = (
+            np.nan_to_num(a, nan=np.inf) for a in (info.cost, info.max_defect)
+        )
+        for place, chain in enumerate(owners.T):
+            cost, defect = found_cost[:, place], found_defect[:, place]
+            old_cost, old_defect = self.cost[indices, chain], self.defect[indices, chain]
+            feasible, was = defect < FEASIBLE, old_defect < FEASIBLE
+            better = np.where(feasible, cost < old_cost, defect < old_defect)
+            better = np.where(feasible == was, better, feasible)
+            rows, to = indices[better], chain[better]
+            self.cost[rows, to], self.defect[rows, to] = cost[better], defect[better]
+            self.x[rows, to], self.u[rows, to] = knots.x[better, place], knots.u[better, place]
+            self.gains[rows, to] = gains[better, place]
+
+    def solution(self, solve_time: float) -> BatchSolution:
+        """The best chain of every problem, replayed."""
+        clock = time.perf_counter()
+        feasible = self.defect < FEASIBLE
+        order = np.lexsort((np.where(feasible, self.cost, self.defect), ~feasible), axis=1)
+        rows, best = np.arange(self.family.count), order[:, 0]
+        x, u, gains = (array[rows, best] for array in (self.x, self.u, self.gains))
+        start = np.broadcast_to(self.family.problem.x_init, (len(rows), x.shape[-1]))
+        plan = np.concatenate([start[:, None], x], axis=1)
+        open_loop, feedback = (
+            _replayed(self.family, plan, u, share * gains) for share in (0.0, 1.0)
+        )
+        return BatchSolution(
+            family=self.family,
+            x=plan,
+            u=u,
+            gains=gains,
+            chain_cost=self.cost,
+            chain_defect=self.defect,
+            best=best,
+            open_loop=open_loop,
+            feedback=feedback,
+            compile_time=self.compile_time,
+            solve_time=solve_time,
+            replay_time=time.perf_counter() - clock,
+        )
+
+
+def _drawn(chains: int, problem: Problem, key: Array) -> Trajectory:
+    """Initial knots of every chain of one problem."""
+    return initial_knots(problem, chains, None, jax.random.fold_in(key, 0))
+
+
+@jax.jit
+def _evaluated(family: Family, knots: Trajectory) -> Info:
+    """Cost, max|h| and bound violation of every chain of every problem, (N, chains)."""
+    return family.over(evaluate)(family.problem, knots)
+
+
+@partial(jax.jit, static_argnames="tail")
+def _flowed(
+    flow: Langevin,
+    family: Family,
+    scales: Scale,
+    knots: Trajectory,
+    keys: Array,
+    total: ArrayLike,
+    tail: bool,
+) -> tuple[Trajectory, Array, Info]:
+    """All iterations of an attempt: knots, gains and diagnostics, (N, chains, ...)."""
+
+    def one(
+        problem: Problem, scale: Scale, knots: Trajectory, key: Array
+    ) -> tuple[Trajectory, Array, Info]:
+        solver = replace(flow, scale=scale)
+        state = solver.init(problem, knots, jax.random.fold_in(key, 1))
+        state = advance(solver, problem, state, 0, total, tail)
+        return (
+            replace(state.trajectory, slack=None),
+            state.gains,
+            evaluate(problem, state.trajectory),
+        )
+
+    return family.over(one)(family.problem, scales, knots, keys)
+
+
+def _replayed(family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> Replays:
+    """The best chain of every problem, applied from its x_0."""
+    first = family.at(0)
+    if family.varies("dynamics", "bounds"):
+        each = [
+            family.at(i).replay(*(a[i : i + 1] for a in (plan, u, gains))) for i in range(len(u))
+        ]
+        ran = np.concatenate([run[0] for run in each]), np.concatenate([run[1] for run in each])
+    else:
+        ran = first.replay(plan, u, gains)
+
+    def evaluated(knots: Trajectory) -> Info:
+        info = _evaluated(family, jax.tree.map(lambda a: a[:, None], knots))
+        return jax.tree.map(lambda a: a[:, 0], info)
+
+    return judged(first, plan, ran, evaluated)

@@ -1,0 +1,165 @@
+"""Many problems at once: each solved as it would be alone, whatever is solved beside it."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+from mjx_drax import (
+    DraxError,
+    Langevin,
+    Restarts,
+    batch,
+    from_function,
+    from_mjcf,
+    solve_batch,
+)
+
+DT = 0.1
+SOLVER = Restarts(replace(Restarts().flow, iterations=30, tail=20), descent=20, attempts=3)
+
+
+def plant(mass, x, u):
+    return x + DT * jnp.array([x[1], u[0] / mass])
+
+
+def miss(target, x):
+    return 10.0 * (x - target)
+
+
+def problem(mass=1.0, target=(0.5, 0.0)):
+    return from_function(
+        Partial(plant, jnp.asarray(mass)),
+        x_init=[0.0, 0.0],
+        nu=1,
+        dt=DT,
+        horizon=10 * DT,
+        running_residual=lambda x, u: 0.1 * u,
+        terminal_residual=Partial(miss, jnp.asarray(target)),
+        u_bounds=(-4.0, 4.0),
+    )
+
+
+BASE = problem()
+STARTS = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 2)).astype(np.float32)
+
+
+def from_start(x):
+    return replace(BASE, x_init=x)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return solve_batch(from_start, STARTS, chains=3, solver=SOLVER)
+
+
+def test_every_problem_is_solved_from_its_own_start(whole):
+    assert whole.certified.all()
+    np.testing.assert_array_equal(whole.x[:, 0], STARTS)
+    assert whole.open_loop.max_deviation.max() < 1e-4
+    states = whole.x[:, 0]
+    for k in range(10):
+        step = np.concatenate([states[:, 1:], whole.u[:, k]], axis=1)
+        states = states + DT * step
+        np.testing.assert_allclose(states, whole.x[:, k + 1], atol=1e-4)
+    # An optimum of a convex problem: from the other side of the target, the other way
+    mirrored = solve_batch(
+        lambda x: replace(BASE, x_init=jnp.array([1.0, 0.0]) - x), STARTS, chains=3, solver=SOLVER
+    )
+    np.testing.assert_allclose(mirrored.u, -whole.u, atol=2e-3)
+
+
+def test_answers_do_not_depend_on_how_the_batch_is_split(whole):
+    split = solve_batch(from_start, STARTS, chains=3, solver=SOLVER, chunk=3)
+    np.testing.assert_array_equal(split.u, whole.u)
+    np.testing.assert_array_equal(split.chain_cost, whole.chain_cost)
+    alone = solve_batch(from_start, STARTS[3:4], chains=3, solver=SOLVER)
+    assert abs(alone.cost[0] - whole.cost[3]) < 1e-4  # other random numbers, the same optimum
+
+
+def test_any_number_of_a_problem_may_differ():
+    masses, targets = np.array([0.5, 1.0, 2.0]), np.array([[0.2, 0.0], [0.3, 0.1], [-0.2, 0.0]])
+
+    def make(value):
+        mass, target = value
+        terminal = replace(BASE.terminal, residual=Partial(miss, target))
+        dynamics = replace(BASE.dynamics, function=Partial(plant, mass))
+        return replace(BASE, dynamics=dynamics, terminal=terminal)
+
+    found = solve_batch(make, (masses, targets), chains=2, solver=SOLVER)
+    assert found.certified.all()
+    np.testing.assert_allclose(found.open_loop.states[:, -1], targets, atol=0.05)
+    end = np.zeros(2)
+    for k in range(10):
+        end = end + DT * np.array([end[1], found.u[2, k, 0] / masses[2]])
+    np.testing.assert_allclose(found.x[2, -1], end, atol=1e-4)
+
+
+def test_finished_problems_leave_the_batch(monkeypatch):
+    sizes = []
+    chunk = batch._Search._chunk
+
+    def counted(self, indices, count, attempt):
+        sizes.append((attempt, count))
+        chunk(self, indices, count, attempt)
+
+    monkeypatch.setattr(batch._Search, "_chunk", counted)
+    # In one iteration no chain becomes feasible
+    solver = replace(SOLVER, descent=1, flow=replace(SOLVER.flow, iterations=1, tail=0))
+    solve_batch(from_start, STARTS, chains=3, solver=solver, chunk=3)
+    assert sizes == [(a, n) for a in range(3) for n in (3, 2)]
+    sizes.clear()
+    solve_batch(from_start, STARTS, chains=3, solver=SOLVER, chunk=3)
+    assert sizes == [(0, 3), (0, 2)]
+
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.02"/>
+  <worldbody>
+    <body>
+      <joint name="pin" type="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="pin" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_models_are_replayed_by_the_c_engine():
+    swing = from_mjcf(PENDULUM, horizon=0.1, running_residual=lambda data, u: u)
+    starts = np.array([[0.3, 0.0], [-0.3, 0.0]])
+    solver = Langevin(iterations=1, tail=4)
+    found = solve_batch(lambda x: replace(swing, x_init=x), starts, chains=1, solver=solver)
+    np.testing.assert_allclose(found.open_loop.states[:, 0], starts, rtol=1e-6)
+    np.testing.assert_allclose(found.open_loop.states, found.x, atol=1e-3)
+    heavier = swing.dynamics.model.body_mass * jnp.array([[1.0], [2.0]])
+
+    def make(mass):
+        model = swing.dynamics.model.replace(body_mass=mass)
+        return replace(swing, dynamics=replace(swing.dynamics, model=model))
+
+    with pytest.raises(DraxError, match="would replay another"):
+        solve_batch(make, heavier)
+
+
+@pytest.mark.parametrize(
+    ("values", "rest", "message"),
+    [
+        ((np.zeros((3, 2)), np.zeros(2)), {}, "first axis"),
+        ((), {}, "first axis"),
+        (np.zeros((0, 2)), {}, "first axis"),
+        (STARTS, {"chains": 0}, "chains is 0"),
+        (STARTS, {"chunk": -1}, "chunk is -1"),
+        (np.zeros((3, 5)), {}, "x_init has shape"),
+    ],
+)
+def test_what_misfits_is_refused(values, rest, message):
+    def make(value):
+        return from_start(value[0] if isinstance(value, tuple) else value)
+
+    with pytest.raises(DraxError, match=message):
+        solve_batch(make, values, **rest)
