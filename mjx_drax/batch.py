@@ -19,8 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 from jax.typing import ArrayLike
 
+from mjx_drax.devices import SPLIT, mesh_for, spread
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate
 from mjx_drax.problem import Problem, Trajectory, checked
@@ -93,30 +96,33 @@ class Family:
             )
         return family
 
-    def _each(self, change: Callable[[Any], Any]) -> Problem:
+    def _changed(self, change: Callable[[Any], Any]) -> Problem:
         """The problem with another value for each leaf that differs."""
         leaves, tree = jax.tree.flatten(self.problem)
         new = [change(a) if d else a for a, d in zip(leaves, self.differs, strict=True)]
         return jax.tree.unflatten(tree, new)
 
+    def each(self, differs: Any, shared: Any) -> Any:
+        """A problem that holds one of two things, according to whether a leaf differs."""
+        tree = jax.tree.structure(self.problem)
+        return jax.tree.unflatten(tree, [differs if d else shared for d in self.differs])
+
     def varies(self, *names: str) -> bool:
         """Whether any number in those attributes of the problem differs."""
-        tree = jax.tree.structure(self.problem)
-        differs = jax.tree.unflatten(tree, self.differs)
+        differs = self.each(True, False)
         return any(any(jax.tree.leaves(getattr(differs, name))) for name in names)
 
     def at(self, i: int) -> Problem:
         """One of the problems."""
-        return self._each(lambda leaf: leaf[i])
+        return self._changed(lambda leaf: leaf[i])
 
     def some(self, indices: np.ndarray) -> Family:
         """Those problems, in that order."""
-        return replace(self, problem=self._each(lambda leaf: leaf[indices]), count=len(indices))
+        return replace(self, problem=self._changed(lambda leaf: leaf[indices]), count=len(indices))
 
     def over(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """function(problem, ...) over all problems, and over the first axis of what follows."""
-        tree = jax.tree.structure(self.problem)
-        axes = jax.tree.unflatten(tree, [0 if d else None for d in self.differs])
+        axes = self.each(0, None)
 
         def mapped(problem: Problem, *arguments: Any) -> Any:
             return jax.vmap(function, in_axes=(axes, *[0] * len(arguments)))(problem, *arguments)
@@ -189,6 +195,7 @@ def solve_batch(
     solver: Langevin | Restarts | None = None,
     chunk: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    devices: int | None = None,
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
 
@@ -203,6 +210,7 @@ def solve_batch(
         solver: `Restarts()` by default.
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
         progress: called with (problems done, of how many) after every chunk.
+        devices: how many to spread a chunk over; by default as many of this host's as divide it.
 
     Where f has kinks (contacts), chains are not led on along replays as `solve` does.
 
@@ -220,7 +228,7 @@ def solve_batch(
     size = min(chunk or fitting(family.at(0), chains), family.count)
     if size < 1:
         raise DraxError(f"chunk is {chunk!r}: give a whole number of at least 1.")
-    search = _Search(family, int(chains), seed, solver, size)
+    search = _Search(family, int(chains), seed, solver, size, mesh_for(size, devices))
     clock = time.perf_counter()
     search.run(progress)
     return search.solution(time.perf_counter() - clock - search.compile_time)
@@ -242,9 +250,17 @@ def fitting(problem: Problem, chains: int) -> int:
 class _Search:
     """The attempts of a batch; what is kept of every chain is on the host."""
 
-    def __init__(self, family: Family, chains: int, seed: int, solver: Restarts, size: int) -> None:
+    def __init__(
+        self,
+        family: Family,
+        chains: int,
+        seed: int,
+        solver: Restarts,
+        size: int,
+        mesh: Mesh | None,
+    ) -> None:
         self.family, self.chains, self.seed = family, chains, seed
-        self.solver, self.size = solver, size
+        self.solver, self.size, self.mesh = solver, size, mesh
         self.compile_time = 0.0
         problem, shape = family.problem, (family.count, chains)
         K, dynamics = problem.horizon, problem.dynamics
@@ -298,9 +314,9 @@ class _Search:
         scales = Scale(jnp.asarray(cost, knots.x.dtype), jnp.asarray(noise, knots.x.dtype))
         total, tail = int(flow.iterations + flow.tail), int(flow.tail) > 0
         if not self.compile_time:
-            jax.block_until_ready(_flowed(flow, some, scales, knots, keys, 0, tail))
+            jax.block_until_ready(_flowed(flow, some, scales, knots, keys, 0, tail, self.mesh))
             self.compile_time = time.perf_counter() - clock
-        found = _flowed(flow, some, scales, knots, keys, total, tail)
+        found = _flowed(flow, some, scales, knots, keys, total, tail, self.mesh)
         self._keep(indices[:count], *jax.tree.map(lambda a: np.asarray(a)[:count], found))
 
     def _keep(self, indices: np.ndarray, knots: Trajectory, gains: np.ndarray, info: Info) -> None:
@@ -366,7 +382,7 @@ def _evaluated(family: Family, knots: Trajectory) -> Info:
     return family.over(evaluate)(family.problem, knots)
 
 
-@partial(jax.jit, static_argnames="tail")
+@partial(jax.jit, static_argnames=("tail", "mesh"))
 def _flowed(
     flow: Langevin,
     family: Family,
@@ -375,22 +391,32 @@ def _flowed(
     keys: Array,
     total: ArrayLike,
     tail: bool,
+    mesh: Mesh | None,
 ) -> tuple[Trajectory, Array, Info]:
     """All iterations of an attempt: knots, gains and diagnostics, (N, chains, ...)."""
 
-    def one(
-        problem: Problem, scale: Scale, knots: Trajectory, key: Array
+    def each(
+        flow: Langevin,
+        total: Array,
+        problem: Problem,
+        scales: Scale,
+        knots: Trajectory,
+        keys: Array,
     ) -> tuple[Trajectory, Array, Info]:
-        solver = replace(flow, scale=scale)
-        state = solver.init(problem, knots, jax.random.fold_in(key, 1))
-        state = advance(solver, problem, state, 0, total, tail)
-        return (
-            replace(state.trajectory, slack=None),
-            state.gains,
-            evaluate(problem, state.trajectory),
-        )
+        def one(
+            problem: Problem, scale: Scale, knots: Trajectory, key: Array
+        ) -> tuple[Trajectory, Array, Info]:
+            solver = replace(flow, scale=scale)
+            state = solver.init(problem, knots, jax.random.fold_in(key, 1))
+            state = advance(solver, problem, state, 0, total, tail)
+            found = replace(state.trajectory, slack=None)
+            return found, state.gains, evaluate(problem, state.trajectory)
 
-    return family.over(one)(family.problem, scales, knots, keys)
+        return family.over(one)(problem, scales, knots, keys)
+
+    specs = family.each(SPLIT, P())
+    part = spread(each, mesh, P(), P(), specs, SPLIT, SPLIT, SPLIT)
+    return part(flow, jnp.asarray(total), family.problem, scales, knots, keys)
 
 
 def _replayed(family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> Replays:

@@ -29,8 +29,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 from jax.typing import ArrayLike
 
+from mjx_drax.devices import SPLIT, mesh_for, spread
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import (
     DAMPING,
@@ -155,6 +158,11 @@ class Attempt:
     converged_at: np.ndarray
 
     @property
+    def cost(self) -> np.ndarray:
+        """Of the knots, (chains,)."""
+        return np.asarray(self.info.cost)
+
+    @property
     def feasible(self) -> np.ndarray:
         """Whether max|h| < `FEASIBLE`, (chains,)."""
         return np.asarray(self.info.max_defect) < FEASIBLE
@@ -183,6 +191,7 @@ def run(
     guess: Trajectory | None = None,
     progress: Progress | None = None,
     recorder: Recorder | None = None,
+    devices: int | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments.
 
@@ -197,7 +206,8 @@ def run(
     solver.check(problem)
     if isinstance(solver, Langevin):
         solver = Restarts(solver, descent=None, attempts=1)
-    return _Search(problem, chains, seed, guess, progress, recorder).run(solver)
+    mesh = mesh_for(chains, devices)
+    return _Search(problem, chains, seed, guess, progress, recorder, mesh).run(solver)
 
 
 class _Search:
@@ -211,8 +221,9 @@ class _Search:
         guess: Trajectory | None,
         progress: Progress | None,
         recorder: Recorder | None,
+        mesh: Mesh | None,
     ) -> None:
-        self.problem, self.chains, self.seed = problem, chains, seed
+        self.problem, self.chains, self.seed, self.mesh = problem, chains, seed, mesh
         self.guess, self.progress, self.recorder = guess, progress, recorder
         self.records: list[tuple[int, Info]] = []
         self.began: list[tuple[int, int]] = []
@@ -229,7 +240,7 @@ class _Search:
         _require_finite(self.problem, info)
         unit = unit_of(np.asarray(info.cost))
         first = solver.first(unit)
-        jax.block_until_ready(_advance(first, self.problem, state, 0, 0, int(flow.tail) > 0))
+        jax.block_until_ready(self._advanced(first, state, 0, 0, int(flow.tail) > 0))
         if solver.attempts > 1:
             _gather((state, info), (state, info), np.arange(self.chains))
         if self.recorder is not None:
@@ -240,9 +251,8 @@ class _Search:
         self.records.append((0, info))
         kept, complete = self._attempt(first, state, info, np.arange(self.chains), total)
         for attempt in range(1, solver.attempts):
-            left = np.flatnonzero(
-                ~finished(np.asarray(kept.info.cost), kept.feasible, solver.within, unit)
-            )
+            done = finished(kept.cost, kept.feasible, solver.within, unit)
+            left = np.flatnonzero(~done)
             if not complete or len(left) <= (1.0 - enough) * self.chains:
                 break
             owners = np.resize(left, self.chains)
@@ -251,12 +261,8 @@ class _Search:
             if kinked:
                 flow = solver.first(unit)
             elif solver.descent is not None:
-                flow = replace(
-                    flow,
-                    scale=_scale(
-                        unit, np.sqrt(level(np.asarray(kept.info.cost), kept.feasible, unit))
-                    ),
-                )
+                temperature = level(kept.cost, kept.feasible, unit)
+                flow = replace(flow, scale=_scale(unit, np.sqrt(temperature)))
             try:
                 found, complete = self._attempt(flow, *self._start(flow, attempt), owners, total)
                 kept = _best(kept, found, owners)
@@ -304,7 +310,7 @@ class _Search:
         """The attempt after the last `STEPS` of the tail's iterations, once more."""
         total = flow.iterations + flow.tail
         state = replace(kept.state, damping=jnp.asarray(damping, kept.state.damping.dtype))
-        state, info = _advance(flow, self.problem, state, total - STEPS, total, True)
+        state, info = self._advanced(flow, state, total - STEPS, total)
         self.done += STEPS
         return Attempt(state, info, np.full(self.chains, self.done))
 
@@ -328,7 +334,7 @@ class _Search:
         states, controls = problem.replay(problem.with_start(knots), knots.u, gains)
         replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
         state = _moved_to(flow, problem, kept.state, replayed)
-        state, info = _advance(flow, problem, state, 0, 0, True)  # compiled already; just evaluates
+        state, info = self._advanced(flow, state, 0, 0)  # compiled already; just evaluates
         return Attempt(state, info, np.full(self.chains, self.done))
 
     def _attempt(
@@ -352,7 +358,7 @@ class _Search:
         try:
             while done < total:
                 stop = min(done + self._stride(total), total)
-                ahead = _advance(flow, self.problem, at.state, done, stop, tail)
+                ahead = self._advanced(flow, at.state, done, stop, tail)
                 (state, info), done = jax.block_until_ready(ahead), stop
                 self.done = before + done
                 feasible = np.asarray(info.max_defect) < FEASIBLE
@@ -363,19 +369,38 @@ class _Search:
             return at, False
         return at, True
 
+    def _advanced(
+        self, flow: Langevin, state: State, start: int, stop: int, tail: bool = True
+    ) -> tuple[State, Info]:
+        """Iterations start..stop-1 on all devices."""
+        return _advance(flow, self.problem, state, start, stop, tail, self.mesh)
+
     def _stride(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""
         usual = max(CHUNK, total // 100)
         return usual if self.recorder is None else min(usual, self.recorder.every)
 
 
-@partial(jax.jit, static_argnames="tail")
+@partial(jax.jit, static_argnames=("tail", "mesh"))
 def _advance(
-    flow: Langevin, problem: Problem, state: State, start: ArrayLike, stop: ArrayLike, tail: bool
+    flow: Langevin,
+    problem: Problem,
+    state: State,
+    start: ArrayLike,
+    stop: ArrayLike,
+    tail: bool,
+    mesh: Mesh | None = None,
 ) -> tuple[State, Info]:
     """`advance` and `evaluate` in one launch."""
-    state = advance(flow, problem, state, start, stop, tail)
-    return state, evaluate(problem, state.trajectory)
+
+    def chains(
+        flow: Langevin, problem: Problem, state: State, start: Array, stop: Array
+    ) -> tuple[State, Info]:
+        state = advance(flow, problem, state, start, stop, tail)
+        return state, evaluate(problem, state.trajectory)
+
+    each = spread(chains, mesh, P(), P(), SPLIT, P(), P())
+    return each(flow, problem, state, jnp.asarray(start), jnp.asarray(stop))
 
 
 _moved_to = jax.jit(Langevin.moved_to)

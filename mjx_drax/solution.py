@@ -280,6 +280,7 @@ def solve(
     guess: Trajectory | None = None,
     progress: Progress | None = None,
     record: int | None = None,
+    devices: int | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
 
@@ -296,6 +297,8 @@ def solve(
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for
             `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
             and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
+        devices: how many to spread the chains over; by default as many of this host's as divide
+            their number.
 
     Returns:
         the solution with its certificate; look at `solution.certified`.
@@ -308,7 +311,7 @@ def solve(
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     solver = solver or Restarts()
     recorder = None if record is None else Recorder(record)
-    found = run(problem, chains, seed, solver, guess, progress, recorder)
+    found = run(problem, chains, seed, solver, guess, progress, recorder, devices)
     solution = _certified(problem, solver, seed, found)
     return solution if recorder is None else replace(solution, recording=recorder.recording())
 

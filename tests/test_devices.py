@@ -1,0 +1,58 @@
+"""Chains spread over devices: the same answers. Virtual CPU devices, in a process of their own."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mjx_drax import DraxError
+from mjx_drax.devices import mesh_for
+
+PROGRAM = """
+from dataclasses import replace
+import jax, jax.numpy as jnp, numpy as np
+from mjx_drax import Restarts, from_function, solve, solve_batch
+
+assert len(jax.devices()) == 8
+problem = from_function(
+    lambda x, u: x + 0.1 * jnp.array([x[1], u[0] - jnp.sin(x[0])]),
+    x_init=[0.5, 0.0], nu=1, dt=0.1, horizon=1.0,
+    running_residual=lambda x, u: 0.1 * u, terminal_residual=lambda x: 10.0 * x,
+    u_bounds=(-2.0, 2.0),
+)
+solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, attempts=2)
+alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, None))
+np.testing.assert_allclose(spread.trajectories.u, alone.trajectories.u, atol=1e-4)
+np.testing.assert_allclose(spread.cost, alone.cost, rtol=1e-4)
+starts = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2)).astype(np.float32)
+one, many = (
+    solve_batch(lambda x: replace(problem, x_init=x), starts, 2, 0, solver, devices=n)
+    for n in (1, 8)
+)
+np.testing.assert_allclose(many.u, one.u, atol=1e-4)
+print("same", spread.solve_time)
+"""
+
+
+def test_eight_devices_give_the_answers_of_one():
+    flags = "--xla_force_host_platform_device_count=8"
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    ran = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.stdout.startswith("same"), ran.stderr
+
+
+@pytest.mark.parametrize("devices", [0, 1000, "two"])
+def test_devices_that_are_not_there_are_refused(devices):
+    with pytest.raises(DraxError, match="give a whole number from 1 to"):
+        mesh_for(8, devices)
+
+
+def test_one_device_needs_no_mesh():
+    assert mesh_for(7, None) is None
