@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.tree_util import Partial
 
-from mjx_drax import Problem, Terms, from_mjcf
+from mjx_drax import Problem, Terms, Trajectory, from_mjcf, guesses
+from mjx_drax.dynamics import Dynamics
 from mjx_drax.mjcf import load
 from mjx_drax.models import path
 
@@ -19,18 +23,23 @@ MARGIN = 0.02  # between the hull, a sphere about all that flies, and each bar [
 SIDES = ("left", "right", "below", "above")
 BARS = ["pillar", *(f"{gate}_{side}" for gate in ("first", "second") for side in SIDES)]
 GATES = np.array([[-1.2, 0.6, 1.4], [1.2, -0.6, 0.9]])  # their middles [m]
+SCATTER = 0.2  # of initial knots about the way [m, rad, m/s, rad/s, N]
+OPEN, DEPTH = (
+    0.15,
+    0.3,
+)  # how far from its middle a gate is passed, and how deep its funnels are [m]
 
 
 def make(horizon: float = 4.0) -> Problem:
     """From hovering on the left, through both gates, to hovering on the right."""
     model = load(path("quadrotor"))
-    return from_mjcf(
+    problem = from_mjcf(
         model,
         horizon=horizon,
         dt=DT,
         running_residual=effort,
         terminal_residual=arrival,
-        inequality=Terms(model).clearance("hull", BARS, margin=MARGIN),
+        inequality=Terms(model).clearance("hull", BARS, margin=MARGIN) + funnels,
         contacts=False,  # the constraint keeps the plan clear; the C engine lets things touch
         goal=lambda data: (
             np.linalg.norm(data.qpos[:3] - GOAL) < 0.1
@@ -39,15 +48,37 @@ def make(horizon: float = 4.0) -> Problem:
         ),
         name="quadrotor",
     )
+    guess = Partial(about, problem.dynamics, through_gates(problem))
+    return replace(problem, aside=replace(problem.aside, guess=guess))
+
+
+def through_gates(problem: Problem) -> Trajectory:
+    """Straight from the start to the gates' middles and on to the goal; no quadrotor can do it."""
+    level = [1.0, 0.0, 0.0, 0.0]
+    stops = [*GATES, GOAL]
+    times = float(problem.times[-1]) * np.array([0.35, 0.65, 1.0])
+    poses = [np.concatenate([stop, level]) for stop in stops]
+    return guesses.waypoints(problem, zip(times, poses, strict=True))
+
+
+def about(dynamics: Dynamics, along: Trajectory, key: Array) -> Trajectory:
+    """Knots scattered about a trajectory."""
+    key_x, key_u = jax.random.split(key)
+    away = SCATTER * jax.random.normal(key_x, (len(along.x), dynamics.ndx))
+    push = SCATTER * jax.random.normal(key_u, along.u.shape)
+    return Trajectory(jax.vmap(dynamics.integrate)(along.x, away), along.u + push)
 
 
 def effort(data: Any, u: Array) -> Array:
-    """Thrusts beyond hovering, turning, and being off a gate's middle while near its plane."""
-    off = data.qpos[None, 1:3] - GATES[:, 1:]
-    near = jnp.exp(-jnp.square((data.qpos[0] - GATES[:, 0]) / 0.3))
-    gates = np.sqrt(20.0) * near[:, None] * off
-    turning = np.sqrt(0.1) * data.qvel[3:]
-    return np.sqrt(2 * DT) * jnp.concatenate([u - HOVER, turning, jnp.ravel(gates)])
+    """Thrusts beyond hovering, and turning."""
+    return np.sqrt(2 * DT) * jnp.concatenate([u - HOVER, np.sqrt(0.1) * data.qvel[3:]])
+
+
+def funnels(data: Any, u: Array) -> Array:
+    """Through each gate leads a funnel, as wide as `OPEN` in its plane [m^2]; <= 0 is inside."""
+    off = jnp.sum(jnp.square(data.qpos[None, 1:3] - GATES[:, 1:]), axis=1)
+    near = jnp.exp(-jnp.square((data.qpos[0] - GATES[:, 0]) / DEPTH))
+    return near * off - OPEN**2
 
 
 def arrival(data: Any) -> Array:

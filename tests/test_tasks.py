@@ -1,6 +1,7 @@
 """Tasks and models: they load and are built, stand or hover, and obstacles are real in MuJoCo."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -9,7 +10,7 @@ import pytest
 
 from mjx_drax import tasks
 from mjx_drax.models import path
-from mjx_drax.tasks.quadrotor import BARS, MARGIN
+from mjx_drax.tasks.quadrotor import BARS, GATES, MARGIN, OPEN, funnels
 
 SIZES = {  # nq, nv, nu and K
     "double_pendulum_swingup": (3, 3, 1, 150),
@@ -116,7 +117,18 @@ def test_clearances_are_those_of_mujoco():
     for _ in range(20):
         data.qpos[:3] = rng.uniform([-3, -1.5, 0.3], [3, 1.5, 2.5])
         mujoco.mj_forward(host, data)
-        ours = MARGIN - np.asarray(clearance(np.concatenate([data.qpos, data.qvel])))
+        rows = np.asarray(clearance(np.concatenate([data.qpos, data.qvel])))
+        ours = MARGIN - rows[: len(BARS)]
         theirs = [mujoco.mj_geomDistance(host, data, hull, g, 10.0, None) for g in bars]
         apart = np.array(theirs) > 0  # inside, MuJoCo's is another measure
         assert np.abs(ours - theirs)[apart].max(initial=0) < 1e-4
+
+
+def test_funnels_lead_through_the_gates():
+    """In a gate's plane only its middle is free; far from it all is."""
+    for gate, middle in enumerate(GATES):
+        for off, inside in ((0.0, True), (0.9 * OPEN, True), (1.1 * OPEN, False)):
+            data = SimpleNamespace(qpos=np.concatenate([[*middle, 0.0, 0.0, off], [1, 0, 0, 0]]))
+            assert (np.asarray(funnels(data, None))[gate] <= 0) == inside
+    data = SimpleNamespace(qpos=np.array([0.0, 2.0, 3.0, 1, 0, 0, 0]))
+    assert (np.asarray(funnels(data, None)) < 0).all()
