@@ -16,7 +16,7 @@ SMALL = {
     "quickstart": {"CHAINS": 4, "VIDEO": _SMALL_VIDEO},
     "your_robot": {"CHAINS": 4, "VIDEO": _SMALL_VIDEO},
     "diagnostics": {"CHAINS": 4, "TRAPPED": 8},
-    "thousands": {"CHAINS": 32, "PROBLEMS": 2, "STATES": 16},
+    "thousands": {"CHAINS": 32, "TRAPPED": 8, "PROBLEMS": 2, "STATES": 16},
 }
 
 FAST = ("quickstart", "thousands")
