@@ -70,6 +70,9 @@ EXPORTS = {
 }
 """Files that are written if asked for: flags, names and what they hold."""
 
+PICTURES = ("plot.png", "multipliers.png", "phase.png", "optima.png")
+MOTIONS = ("video.mp4", "timelapse.png", "film.mp4")
+
 OPTIMA = 5
 """So many distinct optima are printed."""
 
@@ -308,9 +311,19 @@ def _solve(options: argparse.Namespace) -> int:
     tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:
         tell(f"film written to {film}")
+        written += [film.name] * (film.resolve().parent == folder.resolve())
+    older = _older(folder, written)
+    if older:
+        tell(f"there from an earlier solve: {', '.join(older)}")
     if options.json and not options.quiet:
         print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
     return 0 if solution.certified else 1
+
+
+def _older(folder: Path, written: Sequence[str]) -> list[str]:
+    """Names of a solve's files in the folder that this one has not written."""
+    names = [*PICTURES, *MOTIONS, *(file for file, _ in EXPORTS.values())]
+    return [name for name in names if name not in written and (folder / name).exists()]
 
 
 def _film(

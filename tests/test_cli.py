@@ -115,9 +115,12 @@ def test_own_model_is_certified_and_written(own, capsys):
 
 def test_status_is_1_when_not_certified(tmp_path, capsys):
     short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video"
+    (tmp_path / "replay.csv").touch()
     status = main([*short.split(), "--out", str(tmp_path)])
     assert status == 1
-    assert "NOT CERTIFIED" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "NOT CERTIFIED" in out
+    assert "there from an earlier solve: replay.csv\n" in out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]
     assert not (tmp_path / "video.mp4").exists()
 
