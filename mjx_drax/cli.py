@@ -84,13 +84,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status is 0 if it did what was asked for, 1 or 2 if not."""
     options = _parser().parse_args(arguments)
     try:
-        return options.run(options)
+        status: int = options.run(options)
+        sys.stdout.flush()
+        return status
     except DraxError as error:
         print(f"mjx-drax: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("mjx-drax: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # who reads, such as head, has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
 
 
 def _parser() -> argparse.ArgumentParser:
