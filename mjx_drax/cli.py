@@ -70,6 +70,9 @@ EXPORTS = {
 }
 """Files that are written if asked for: flags, names and what they hold."""
 
+PICTURES = ("plot.png", "multipliers.png", "phase.png", "optima.png")
+MOTIONS = ("video.mp4", "timelapse.png", "film.mp4")
+
 OPTIMA = 5
 """So many distinct optima are printed."""
 
@@ -81,13 +84,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status is 0 if it did what was asked for, 1 or 2 if not."""
     options = _parser().parse_args(arguments)
     try:
-        return options.run(options)
+        status: int = options.run(options)
+        sys.stdout.flush()
+        return status
     except DraxError as error:
         print(f"mjx-drax: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("mjx-drax: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # who reads, such as head, has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -308,9 +316,19 @@ def _solve(options: argparse.Namespace) -> int:
     tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:
         tell(f"film written to {film}")
+        written += [film.name] * (film.resolve().parent == folder.resolve())
+    older = _older(folder, written)
+    if older:
+        tell(f"there from an earlier solve: {', '.join(older)}")
     if options.json and not options.quiet:
         print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
     return 0 if solution.certified else 1
+
+
+def _older(folder: Path, written: Sequence[str]) -> list[str]:
+    """Names of a solve's files in the folder that this one has not written."""
+    names = [*PICTURES, *MOTIONS, *(file for file, _ in EXPORTS.values())]
+    return [name for name in names if name not in written and (folder / name).exists()]
 
 
 def _film(

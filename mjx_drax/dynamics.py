@@ -199,7 +199,9 @@ def _copied(value: Any, seen: dict[int, Any]) -> Any:
         for name, entry in vars(value.__self__).items():
             object.__setattr__(owner, name, _copied(entry, seen))
         return MethodType(_copied(value.__func__, seen), owner)
-    if not isinstance(value, FunctionType) or value.__module__.split(".")[0] in ("jax", "numpy"):
+    if not isinstance(value, FunctionType):
+        return value
+    if (value.__module__ or "").split(".")[0] in ("jax", "numpy"):
         return value
     names = dict(value.__globals__)
     cells = tuple(CellType() for _ in value.__closure__ or ())

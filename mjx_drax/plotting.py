@@ -185,7 +185,8 @@ def _draw_scene(axes: Axes, solution: Solution, draw: Draw) -> None:
 
 
 def _name(rank: int, optimum: Optimum) -> str:
-    return f"{rank}: cost {optimum.cost:.4g}, {optimum.share:.0%} of chains"
+    share = f"{optimum.share:.0%}" if optimum.share >= 0.01 else f"{optimum.share:.1%}"
+    return f"{rank}: cost {optimum.cost:.4g}, {share} of chains"
 
 
 def _draw_map(axes: Axes, rank: int, optimum: Optimum, draw: Draw) -> None:

@@ -154,7 +154,7 @@ class Solution:
     def status(self) -> list[str]:
         """`converged`, `infeasible` or `diverged`, for every chain."""
         names = np.where(self.feasible, CONVERGED, INFEASIBLE)
-        return list(np.where(self.died_at >= 0, DIVERGED, names))
+        return np.where(self.died_at >= 0, DIVERGED, names).tolist()
 
     @cached_property
     def certified_chains(self) -> np.ndarray:

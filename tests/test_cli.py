@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -62,6 +63,15 @@ def test_help_imports_nothing_heavy():
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
+def test_a_reader_may_stop_reading():
+    code = "import sys; from mjx_drax.cli import main; sys.exit(main(['list']))"
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run([sys.executable, "-c", code], stdout=writing, stderr=subprocess.PIPE)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
 def test_list_names_every_task(capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
@@ -115,9 +125,12 @@ def test_own_model_is_certified_and_written(own, capsys):
 
 def test_status_is_1_when_not_certified(tmp_path, capsys):
     short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video"
+    (tmp_path / "replay.csv").touch()
     status = main([*short.split(), "--out", str(tmp_path)])
     assert status == 1
-    assert "NOT CERTIFIED" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "NOT CERTIFIED" in out
+    assert "there from an earlier solve: replay.csv\n" in out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]
     assert not (tmp_path / "video.mp4").exists()
 

@@ -1,4 +1,7 @@
-"""The notebooks run from top to bottom, and are stored without outputs."""
+"""The notebooks run from top to bottom, and are stored without outputs.
+
+Sizes stand in the cell tagged `parameters`; after it the small ones below take their place.
+"""
 
 import json
 from pathlib import Path
@@ -7,6 +10,16 @@ import matplotlib as mpl
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+_SMALL_VIDEO = {"size": (96, 128), "fps": 5}
+SMALL = {
+    "quickstart": {"CHAINS": 4, "VIDEO": _SMALL_VIDEO},
+    "your_robot": {"CHAINS": 4, "VIDEO": _SMALL_VIDEO},
+    "diagnostics": {"CHAINS": 4, "TRAPPED": 8},
+    "thousands": {"CHAINS": 32, "TRAPPED": 8, "PROBLEMS": 2, "STATES": 16},
+}
+
+FAST = ("quickstart",)
 
 
 def code(path):
@@ -19,11 +32,27 @@ def test_no_outputs_are_stored(path):
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code(path))
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_every_cell_runs(path):
+def test_the_first_cell_installs_what_is_missing(path):
+    assert "git+REPOSITORY" in "".join(code(path)[0]["source"])
+
+
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=[] if path.stem in FAST else pytest.mark.slow)
+        for path in NOTEBOOKS
+    ],
+)
+def test_every_cell_runs(path, tmp_path, monkeypatch):
     mpl.use("Agg")
-    names = {"__name__": "__main__"}
+    monkeypatch.chdir(tmp_path)
+    names, small = {"__name__": "__main__"}, dict(SMALL.get(path.stem, {}))
     for cell in code(path):
         exec(compile("".join(cell["source"]), str(path), "exec"), names)
+        if "parameters" in cell["metadata"].get("tags", []):
+            assert set(small) <= set(names), "sizes that the notebook does not have"
+            names.update(small)
+            small = {}
+    assert not small, "the notebook has no cell tagged `parameters`"

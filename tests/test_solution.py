@@ -401,7 +401,15 @@ def in_closure():
     return lambda x, u: pushed(x, u) + 0.1 * offset
 
 
-@pytest.mark.parametrize("f", [in_closure(), Plant().step], ids=["closure", "method"])
+def of_no_module():
+    f = in_closure()
+    f.__module__ = None  # as of code that is run by exec
+    return f
+
+
+@pytest.mark.parametrize(
+    "f", [in_closure(), Plant().step, of_no_module()], ids=["closure", "method", "no module"]
+)
 def test_functions_may_hold_numpy_arrays(f):
     """Which JAX would remember in the precision of the solve, and then not replay in float64."""
     target = np.array([0.5, 0.1])

@@ -1,0 +1,49 @@
+"""The reference is what the docstrings say, links lead somewhere, and the examples run."""
+
+import re
+import runpy
+import shutil
+from pathlib import Path
+
+import pytest
+
+import mjx_drax
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.fixture(scope="module")
+def generator():
+    return runpy.run_path(str(ROOT / "docs" / "make_api.py"))
+
+
+def test_the_reference_is_up_to_date(generator):
+    stored = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert stored == generator["page"](), "run: python docs/make_api.py"
+
+
+def test_the_reference_has_every_public_name():
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    for name in set(mjx_drax.__all__) - {"guesses"}:
+        assert f"### `mjx_drax.{name}`" in page, "add it to GROUPS in docs/make_api.py"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_examples_run(tmp_path, monkeypatch):
+    shutil.copy(ROOT / "models" / "cartpole.xml", tmp_path / "robot.xml")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for page in ("your_problem.md", "tuning.md"):  # the second goes on with the first's problem
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+            exec(compile(block, page, "exec"), names)
+    assert names["solution"].certified
