@@ -34,7 +34,7 @@ GROUPS: dict[str, list[Any]] = {
         guesses.still,
         guesses.spread,
     ],
-    "Solving": [mjx_drax.solve, mjx_drax.Restarts, mjx_drax.Langevin],
+    "Solving": [mjx_drax.solve, mjx_drax.solve_batch, mjx_drax.Restarts, mjx_drax.Langevin],
     "Parts of the solver": [
         mjx_drax.Geometric,
         mjx_drax.Constant,
@@ -52,6 +52,7 @@ GROUPS: dict[str, list[Any]] = {
     ],
     "Solutions": [
         mjx_drax.Solution,
+        mjx_drax.BatchSolution,
         solution.Replays,
         solution.Certificate,
         optima.Optimum,
@@ -82,12 +83,21 @@ METHODS: dict[str, str] = {
     "Terms": "posture velocity control sensor site body upright centre_of_mass clearance",
     "Solution": "chains feasible success success_rate status certified certified_chains tracked "
     "best_chain best certificate optima outcome replay_mode replayed save load certify",
+    "BatchSolution": "cost max_defect feasible certified replay_modes",
     "Certificate": "success",
     "Minimum": "best_chain best",
 }
 """Methods and properties that users need."""
 
-MADE_FOR_USERS = ("Problem", "Solution", "Replays", "Certificate", "Optimum", "Minimum")
+MADE_FOR_USERS = (
+    "Problem",
+    "Solution",
+    "BatchSolution",
+    "Replays",
+    "Certificate",
+    "Optimum",
+    "Minimum",
+)
 """Classes that users get and do not make."""
 
 _SECTION = re.compile(r"^(Args|Attributes|Returns|Raises|Warns):$")
