@@ -235,7 +235,7 @@ def _add_mpc(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "every": (_positive, 1, "control steps between two plans; default 1"),
         "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),
         "horizon": (float, None, "of a plan [s]; default the task's"),
-        "duration": (float, None, "of a run [s]; default the horizon and 6 more"),
+        "duration": (float, None, "of a run [s]; default the horizon and 8 more"),
         "runs": (_positive, 10, "default 10"),
         "pushes": (int, 2, "in every run; default 2"),
         "push": (float, 1.0, "size of a push, as a velocity of the body pushed [m/s]; default 1"),
@@ -365,7 +365,7 @@ def _mpc(options: argparse.Namespace) -> int:
     problem = task.make() if options.horizon is None else task.make(horizon=options.horizon)
     names = ("chains", "explorers", "iterations", "every", "hold", "seed")
     policy = MPC(problem, **{name: getattr(options, name) for name in names})
-    duration = options.duration or float(problem.times[-1]) + 6.0
+    duration = options.duration or float(problem.times[-1]) + 8.0
     trials = loop.Trials(policy, duration, options.realtime)
     errors = {name: getattr(options, name) for name in ("mass", "noise", "shaking")}
     Plant(problem, **errors)  # complains now

@@ -21,7 +21,7 @@ from mjx_drax.mpc import MPC, Statistics
 from mjx_drax.plant import Plant, Push, random_pushes
 from mjx_drax.problem import Problem
 
-SETTLE = 2.0
+SETTLE = 4.0
 """Time without pushes at the end of a run [s], at least."""
 
 PERCENTILES = 50, 90, 99

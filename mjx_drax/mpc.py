@@ -85,12 +85,16 @@ class Carried:
     Attributes:
         state: of all chains; the explorers are the last ones.
         best: which chain is applied, always a keeper.
+        lost: whether its plan broke the dynamics.
+        spare: the worst keeper, which may be given other knots.
         age: iterations since an explorer last started, (chains,); 0 for keepers.
         key: for the explorers' noise.
     """
 
     state: State
     best: Array
+    lost: Array
+    spare: Array
     age: Array
     key: Array
 
@@ -368,11 +372,19 @@ def _first(state: State, info: Info, explorers: int, seed: int) -> Carried:
     infeasible = ~(np.asarray(info.max_defect) < FEASIBLE)
     rank = np.where(infeasible, np.asarray(info.max_defect), np.asarray(info.cost))
     chains = len(rank)
+    count = chains - explorers
     age = np.zeros(chains, np.int32)
-    age[chains - explorers :] = np.arange(explorers) * CYCLE // max(explorers, 1)
+    age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
     order = np.lexsort((rank, infeasible))
     state = replace(state, died_at=jnp.full(chains, -1, jnp.int32))  # not weakly typed
-    return Carried(_rows(state, order), jnp.int32(0), jnp.asarray(age), jax.random.key(seed))
+    return Carried(
+        _rows(state, order),
+        jnp.int32(0),
+        jnp.array(False),
+        jnp.int32(count - 1),
+        jnp.asarray(age),
+        jax.random.key(seed),
+    )
 
 
 def _rows(state: State, which: ArrayLike) -> State:
@@ -401,6 +413,7 @@ def _plan(
     if explorers:
         key, fresh = jax.random.split(key)
         state = _restarted(heated, problem, state, best, exploring & (age == 0), fresh)
+    state = _led_back(flow, problem, state, carried)
     total = jnp.int32(flow.iterations + flow.tail)
     start = jnp.where(exploring, age, total - iterations)
     state = _iterated(flow, heated, problem, state, exploring, start, iterations)
@@ -423,7 +436,11 @@ def _plan(
     places, found = jnp.arange(chains), exploring[chosen]
     source = jnp.where(alive | exploring, places, chosen)
     source = jnp.where(found & (places == worst), chosen, source)
-    return Carried(_rows(state, source), jnp.where(found, worst, chosen), age, key), plan
+    best = jnp.where(found, worst, chosen)
+    mine = (places == best) | exploring
+    spare = jnp.argmax(jnp.where(mine, -jnp.inf, jnp.where(alive, cost, jnp.inf)))
+    lost = ~(info.max_defect[chosen] < FEASIBLE)
+    return Carried(_rows(state, source), best, lost, spare, age, key), plan
 
 
 def _chosen(info: Info, cost: Array, alive: Array, best: Array) -> Array:
@@ -437,17 +454,47 @@ def _chosen(info: Info, cost: Array, alive: Array, best: Array) -> Array:
     return jnp.argmin(jnp.where(jnp.isfinite(cost).any(), cost, defect))
 
 
+def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) -> State:
+    """The spare keeper's knots replaced by a rollout of the applied plan, if that was lost.
+
+    After a push the knots are far from any motion, and few iterations do not bring them back. The
+    controls with their feedback, followed from x, give a motion to start from.
+    """
+    dynamics, best, box = problem.dynamics, carried.best, problem.bounds
+    knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
+
+    def follow(x: Array, stage: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        planned, u, gain = stage
+        wanted = u + gain @ dynamics.difference(x, planned)
+        u = jnp.clip(wanted, box.u_lower, box.u_upper)
+        x = dynamics.step(x, u)
+        return x, (x, u)
+
+    _, (x, u) = jax.lax.scan(follow, problem.x_init, (problem.stages(knots), knots.u, gains))
+    rolled = Trajectory(jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0))
+    everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
+    moved = flow.moved_to(problem, state, everyone)
+    moved = replace(moved, damping=jnp.ones_like(state.damping))
+    which = carried.lost & (carried.spare != best) & (jnp.arange(len(state.alive)) == carried.spare)
+    return _where(which, moved, state)
+
+
 def _restarted(
     heated: Langevin, problem: Problem, state: State, best: Array, which: Array, key: Array
 ) -> State:
     """The chains (chains,) that are to start again do so from the best one's knots."""
     knots = jax.tree.map(lambda a: jnp.broadcast_to(a[best], a.shape), state.trajectory)
     started = heated.init(problem, replace(knots, slack=None), key)
+    return _where(which, started, state)
 
-    def chosen(old: Array, new: Array) -> Array:
-        return jnp.where(which.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
-    return jax.tree.map(chosen, state, started)
+def _where(which: Array, new: State, old: State) -> State:
+    """The new state for some chains (chains,), the old one for the others."""
+
+    def chosen(a: Array, b: Array) -> Array:
+        return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(chosen, new, old)
 
 
 def _iterated(
