@@ -555,7 +555,9 @@ def _shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State
         slack = None if z.slack is None else stages(z.slack)
         return Trajectory(rows(z.x), rows(z.u), slack)
 
-    of_bounds = None if multipliers.bounds is None else tuple(map(shifted, multipliers.bounds))
+    of_bounds = multipliers.bounds
+    if of_bounds is not None:
+        of_bounds = shifted(of_bounds[0]), shifted(of_bounds[1])
     later = replace(
         multipliers,
         dynamics=rows(multipliers.dynamics),
