@@ -201,6 +201,7 @@ class MPC:
         self.statistics = Statistics()
         self.first_solve = 0.0
         self._plan: Plan | None = None
+        self._time = 0.0
         self._start: tuple[Carried, Plan] | None = None
         self._lower, self._upper = (
             np.asarray(end, float) for end in (problem.bounds.u_lower, problem.bounds.u_upper)
@@ -238,6 +239,7 @@ class MPC:
         )
         self._traced = jax.device_put(problem)
         carried = _first(found.state, found.info, self.explorers, self.seed)
+        self._plan = None
         self._apply(carried, x, t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
         self._start = self._carried, self.latest
@@ -249,7 +251,7 @@ class MPC:
         if self._start is None:
             raise DraxError("there is nothing to go back to: call policy.reset(x) first.")
         self._carried, plan = self._start
-        self._plan = replace(plan, time=t)
+        self._plan, self._time = replace(plan, time=t), t
         self.statistics = Statistics()
         return self._plan
 
@@ -258,7 +260,8 @@ class MPC:
 
         What is not finite is not used: the plan stays, and `statistics.failed` counts it.
         """
-        by = max(0.0, (t - self.latest.time) / float(self.problem.dynamics.dt))
+        self.latest  # noqa: B018 complains if there is none
+        by = max(0.0, (t - self._time) / float(self.problem.dynamics.dt))
         clock = time.perf_counter()
         plan = self._apply(self._carried, x, t, by)
         statistics = self.statistics
@@ -300,6 +303,7 @@ class MPC:
         """Plan in one launch, and use it if it is finite."""
         level = 1.0 if self._plan is None else float(abs(self._plan.cost))
         scale = Scale(self._heated.scale.cost, np.float32(np.sqrt(max(level, 1e-12))))
+        self._time = t  # of what is carried; the plan in use is older after one that failed
         self._carried, device = _plan(
             self._flow,
             replace(self._heated, scale=scale),

@@ -93,7 +93,8 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
 
 def test_a_shift_by_one_knot_moves_all_that_is_carried(policy):
     chain = jax.tree.map(lambda a: a[0], policy._carried.state)
-    shifted = mpc._shifted(policy._flow, policy._traced, jnp.float32(1.0), chain)
+    shift = jax.jit(mpc._shifted)
+    shifted = shift(policy._flow, policy._traced, jnp.float32(1.0), chain)
     for now, then in (
         (shifted.trajectory.x, chain.trajectory.x),
         (shifted.trajectory.u, chain.trajectory.u),
@@ -104,7 +105,7 @@ def test_a_shift_by_one_knot_moves_all_that_is_carried(policy):
         np.testing.assert_allclose(now[:-1], then[1:], rtol=1e-6)
     last = f(chain.trajectory.x[-1], chain.trajectory.u[-1])
     np.testing.assert_allclose(shifted.trajectory.x[-1], last, rtol=1e-5)
-    half = mpc._shifted(policy._flow, policy._traced, jnp.float32(2.5), chain)
+    half = shift(policy._flow, policy._traced, jnp.float32(2.5), chain)
     middle = 0.5 * (chain.trajectory.x[2:-1] + chain.trajectory.x[3:])
     np.testing.assert_allclose(half.trajectory.x[: K - 3], middle, atol=1e-6)
 
@@ -122,7 +123,7 @@ def test_between_plans_the_feedback_acts_about_the_interpolated_plan(policy):
 
 
 def test_what_is_not_finite_changes_nothing_and_is_counted(policy):
-    x, t = policy.latest.x[1], DT
+    t = DT
     u = policy([np.nan, 0.0], t)
     np.testing.assert_allclose(u, policy.latest.u[1])
     assert policy.statistics.unmeasured == 1
@@ -131,16 +132,17 @@ def test_what_is_not_finite_changes_nothing_and_is_counted(policy):
     policy.plan([1e30, 0.0], t)  # its plan overflows
     assert policy.statistics.failed == 1
     assert policy.latest is good
-    policy.plan(x, t)
-    assert policy.latest.time == t
+    policy.plan(good.x[2], 2 * t)
+    assert policy.latest.time == 2 * t
     assert policy.latest.max_defect < 1e-2
+    np.testing.assert_allclose(policy.latest.u[:-2], good.u[2:], atol=0.02)  # shifted by 2, not 3
 
 
 def test_the_terminal_cost_along_the_horizon():
     problem, x, u = balance(), jnp.array([0.3, -0.2]), jnp.array([0.5])
     held = mpc.holding(problem, 2.0)
-    added = held.running_cost(x, u) - problem.running_cost(x, u)
-    assert added == pytest.approx(2.0 * DT * problem.terminal_cost(x), rel=1e-5)
+    added = float(held.running_cost(x, u) - problem.running_cost(x, u))
+    assert added == pytest.approx(2.0 * DT * float(problem.terminal_cost(x)), rel=1e-5)
     assert mpc.holding(problem, 0.0) is problem
 
 
