@@ -178,7 +178,7 @@ class MPC:
             )
         if not (isinstance(hold, float | int | np.number) and np.isfinite(hold) and hold >= 0):
             raise DraxError(f"hold is {hold!r}: give a number of at least 0.")
-        if problem.bounds.x_lower.ndim + problem.bounds.u_lower.ndim > 2:
+        if any(end.ndim > 1 for end in jax.tree.leaves(problem.bounds)):
             raise DraxError(
                 f"bounds of {problem.name} differ from knot to knot, but the horizon recedes: "
                 "give the same ones for all, of shapes (nx,) and (nu,)."
