@@ -35,6 +35,12 @@ GROUPS: dict[str, list[Any]] = {
         guesses.spread,
     ],
     "Solving": [mjx_drax.solve, mjx_drax.solve_batch, mjx_drax.Restarts, mjx_drax.Langevin],
+    "Model predictive control": [
+        mjx_drax.MPC,
+        mjx_drax.Background,
+        mjx_drax.Plant,
+        mjx_drax.Push,
+    ],
     "Parts of the solver": [
         mjx_drax.Geometric,
         mjx_drax.Constant,
@@ -84,6 +90,8 @@ METHODS: dict[str, str] = {
     "Solution": "chains feasible success success_rate status certified certified_chains tracked "
     "best_chain best certificate optima outcome replay_mode replayed save load certify",
     "BatchSolution": "cost max_defect feasible certified replay_modes",
+    "MPC": "latest reset rewind plan control due",
+    "Plant": "time state measured step",
     "Certificate": "success",
     "Minimum": "best_chain best",
 }

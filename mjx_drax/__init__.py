@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mjx_drax import guesses as guesses
+    from mjx_drax.background import Background as Background
     from mjx_drax.batch import BatchSolution as BatchSolution
     from mjx_drax.batch import solve_batch as solve_batch
     from mjx_drax.bounds import LogBarrier as LogBarrier
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
     from mjx_drax.ghosts import render_timelapse as render_timelapse
     from mjx_drax.langevin import Langevin as Langevin
     from mjx_drax.mjcf import from_mjcf as from_mjcf
+    from mjx_drax.mpc import MPC as MPC
+    from mjx_drax.plant import Plant as Plant
+    from mjx_drax.plant import Push as Push
     from mjx_drax.precondition import Diagonal as Diagonal
     from mjx_drax.precondition import GaussNewton as GaussNewton
     from mjx_drax.precondition import Identity as Identity
@@ -53,6 +57,10 @@ __version__ = "0.1.0"
 _HOME = {
     "BatchSolution": "batch",
     "solve_batch": "batch",
+    "Background": "background",
+    "MPC": "mpc",
+    "Plant": "plant",
+    "Push": "plant",
     "LogBarrier": "bounds",
     "DraxError": "errors",
     "export_keyframes": "export",

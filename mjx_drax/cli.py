@@ -178,6 +178,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     solving.set_defaults(run=_solve)
 
+    _add_mpc(commands)
+
     exporting = commands.add_parser(
         "export",
         help="more files from a result that `solve` has written",
@@ -223,6 +225,45 @@ def _parser() -> argparse.ArgumentParser:
     )
     reproducing.set_defaults(run=_reproduce)
     return parser
+
+
+def _add_mpc(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "mpc",
+        help="model predictive control: plan again and again while MuJoCo's C engine runs",
+        description="Drive a task's model by model predictive control, several times, with random "
+        "pushes; print plans per second, latency, cost and the share of runs that end in the goal; "
+        "write mpc.json. The exit status is 0 if all do.",
+    )
+    parser.add_argument("task", help="a name from `mjx-drax list`")
+    numbers: dict[str, tuple[Any, Any, str]] = {
+        "chains": (_positive, 8, "number of chains; default 8"),
+        "explorers": (int, None, "how many of them explore; default half"),
+        "iterations": (_positive, 2, "of every chain for a plan; default 2"),
+        "every": (_positive, 1, "control steps between two plans; default 1"),
+        "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),
+        "horizon": (float, None, "of a plan [s]; default the task's"),
+        "duration": (float, None, "of a run [s]; default the horizon and 8 more"),
+        "runs": (_positive, 10, "default 10"),
+        "pushes": (int, 2, "in every run; default 2"),
+        "push": (float, 1.0, "size of a push, as a velocity of the body pushed [m/s]; default 1"),
+        "mass": (float, 1.0, "factor on the plant's masses; default 1"),
+        "noise": (float, 0.0, "standard deviation of measured states; default 0"),
+        "shaking": (float, 0.0, "random changes of velocities in a second; default 0"),
+        "seed": (int, 0, "default 0"),
+    }
+    for name, (kind, default, words) in numbers.items():
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=words)
+    parser.add_argument(
+        "--async",
+        dest="realtime",
+        action="store_true",
+        help="the simulation runs in real time and applies the newest plan",
+    )
+    parser.add_argument("--video", action="store_true", help="film the first run: mpc.mp4")
+    parser.add_argument("--out", metavar="DIR", help="default out/mpc_TASK")
+    parser.add_argument("--json", action="store_true", help="print mpc.json, and nothing else")
+    parser.set_defaults(run=_mpc)
 
 
 def _add_exports(parser: argparse.ArgumentParser) -> None:
@@ -329,6 +370,47 @@ def _older(folder: Path, written: Sequence[str]) -> list[str]:
     """Names of a solve's files in the folder that this one has not written."""
     names = [*PICTURES, *MOTIONS, *(file for file, _ in EXPORTS.values())]
     return [name for name in names if name not in written and (folder / name).exists()]
+
+
+def _mpc(options: argparse.Namespace) -> int:
+    from mjx_drax import loop, rendering, results, tasks
+    from mjx_drax.mpc import MPC
+    from mjx_drax.plant import Plant
+
+    if options.pushes < 0:
+        raise DraxError(f"--pushes is {options.pushes}: give a number of at least 0.")
+    task = tasks.load(options.task)
+    problem = task.make() if options.horizon is None else task.make(horizon=options.horizon)
+    names = ("chains", "explorers", "iterations", "every", "hold", "seed")
+    policy = MPC(problem, **{name: getattr(options, name) for name in names})
+    duration = options.duration or float(problem.times[-1]) + 8.0
+    trials = loop.Trials(policy, duration, options.realtime)
+    errors = {name: getattr(options, name) for name in ("mass", "noise", "shaking")}
+    Plant(problem, **errors)  # complains now
+    if options.video:
+        rendering.check(problem)
+    folder = results.writable(options.out or Path("out") / f"mpc_{problem.name}")
+    tell = _silent if options.json else say
+    _cache_compilations()
+    tell(f"{problem.name}: K = {problem.horizon} knots, {options.chains} chains; compiling ...")
+    policy.reset(problem.x_init)
+    tell(f"first solve and compilation took {policy.first_solve:.1f} s")
+
+    def report(run: int, motion: loop.Motion) -> None:
+        verdict = {True: "ends in the goal", False: "misses the goal", None: "done"}
+        tell(f"run {run}: {verdict[motion.reached]} after {len(motion.pushes)} pushes")
+
+    trials.run(options.runs, options.pushes, options.push, options.seed, report, **errors)
+    numbers = {**trials.summary(), "push": options.push, "hold": options.hold, **errors}
+    written = [loop.save(numbers, folder).name]
+    if options.video:
+        written.append(loop.film(problem, trials.motions[0], folder / "mpc.mp4").name)
+    for line in loop.lines(numbers):
+        tell(line)
+    tell(f"written to {folder}/: {', '.join(written)}")
+    if options.json:
+        print((folder / "mpc.json").read_text(encoding="utf-8"), end="", flush=True)
+    return 0 if numbers["success_rate"] in (None, 1.0) else 1
 
 
 def _film(

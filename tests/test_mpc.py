@@ -1,0 +1,286 @@
+"""Model predictive control: shifting, falling back, and the loop with MuJoCo's C engine."""
+
+import json
+import time
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax import (
+    MPC,
+    Background,
+    DraxError,
+    Identity,
+    Langevin,
+    Plant,
+    Push,
+    Restarts,
+    from_function,
+    from_mjcf,
+    loop,
+    mpc,
+)
+from mjx_drax.cli import main
+from mjx_drax.plant import random_pushes
+
+DT, K = 0.1, 15
+FAST = Restarts(replace(Restarts().flow, iterations=30, tail=30), descent=40, attempts=1)
+
+SLIDER = """
+<mujoco model="slider">
+  <option timestep="0.01" integrator="Euler"><flag contact="disable"/></option>
+  <worldbody><body name="cart">
+    <joint name="slide" type="slide" axis="1 0 0"/>
+    <geom size="0.05" mass="1"/>
+  </body></worldbody>
+  <actuator><motor joint="slide" gear="10" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+
+def f(x, u):
+    """An inverted pendulum with limited torque, x = 0 upright."""
+    return x + DT * jnp.array([x[1], 2.0 * jnp.sin(x[0]) + 4.0 * u[0]])
+
+
+def stepped(x, u):
+    return np.asarray(f(jnp.asarray(x), jnp.asarray(u)), float)
+
+
+def balance(**more):
+    return from_function(
+        f,
+        x_init=[0.5, 0.0],
+        nu=1,
+        dt=DT,
+        horizon=K * DT,
+        running_residual=lambda x, u: 0.3 * u,
+        terminal_residual=lambda x: 3.0 * x,
+        u_bounds=(-1.0, 1.0),
+        **more,
+    )
+
+
+@pytest.fixture(scope="module")
+def solved():
+    policy = MPC(balance(), chains=4, explorers=1, hold=1.0, solver=FAST)
+    policy.reset([0.5, 0.0])
+    return policy
+
+
+@pytest.fixture
+def policy(solved):
+    solved.rewind()
+    return solved
+
+
+def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
+    before = mpc._plan._cache_size()
+    x = np.array([0.5, 0.0])
+    for k in range(60):
+        x = stepped(x, policy(x, k * DT))
+        if k == 20:
+            x = x + np.array([0.1, -0.8])
+    assert np.abs(x).max() < 0.02
+    assert mpc._plan._cache_size() == before
+    assert policy.statistics.plans == 59
+    assert policy.statistics.failed == 0
+    assert np.median(policy.statistics.max_defects) < 1e-4
+
+
+def test_a_shift_by_one_knot_moves_all_that_is_carried(policy):
+    chain = jax.tree.map(lambda a: a[0], policy._carried.state)
+    shift = jax.jit(mpc._shifted)
+    shifted = shift(policy._flow, policy._traced, jnp.float32(1.0), chain)
+    for now, then in (
+        (shifted.trajectory.x, chain.trajectory.x),
+        (shifted.trajectory.u, chain.trajectory.u),
+        (shifted.multipliers.dynamics, chain.multipliers.dynamics),
+        (shifted.multipliers.bounds[0].u, chain.multipliers.bounds[0].u),
+        (shifted.gains, chain.gains),
+    ):
+        np.testing.assert_allclose(now[:-1], then[1:], rtol=1e-6)
+    last = f(chain.trajectory.x[-1], chain.trajectory.u[-1])
+    np.testing.assert_allclose(shifted.trajectory.x[-1], last, rtol=1e-5)
+    half = shift(policy._flow, policy._traced, jnp.float32(2.5), chain)
+    middle = 0.5 * (chain.trajectory.x[2:-1] + chain.trajectory.x[3:])
+    np.testing.assert_allclose(half.trajectory.x[: K - 3], middle, atol=1e-6)
+
+
+def test_between_plans_the_feedback_acts_about_the_interpolated_plan(policy):
+    plan = policy.latest
+    planned = 0.6 * plan.x[3] + 0.4 * plan.x[4]
+    np.testing.assert_allclose(policy.control(planned, 3.4 * DT), plan.u[3], atol=1e-5)
+    off = np.array([1e-3, -2e-3])
+    np.testing.assert_allclose(
+        policy.control(planned + off, 3.4 * DT), plan.u[3] + plan.gains[3] @ off, atol=1e-5
+    )
+    assert policy.control(planned + 100.0, 3.4 * DT).item() in (-1.0, 1.0)  # clipped
+    policy.control(planned, 1e6)  # long after the last knot
+
+
+def test_what_is_not_finite_changes_nothing_and_is_counted(policy, monkeypatch):
+    t, shifts, plan = DT, [], mpc._plan
+    monkeypatch.setattr(mpc, "_plan", lambda *a: shifts.append(float(a[5])) or plan(*a))
+    u = policy([np.nan, 0.0], t)
+    np.testing.assert_allclose(u, policy.latest.u[1])
+    assert policy.statistics.unmeasured == 1
+    assert policy.statistics.plans == 0
+    good = policy.latest
+    policy.plan([1e30, 0.0], t)  # its plan overflows
+    assert policy.statistics.failed == 1
+    assert policy.latest is good
+    policy.plan(good.x[2], 2 * t)
+    assert policy.latest.time == 2 * t
+    assert policy.latest.max_defect < 1e-2
+    np.testing.assert_allclose(shifts, [1.0, 1.0])  # by 2 in all, not by 3
+
+
+def test_the_terminal_cost_along_the_horizon():
+    problem, x, u = balance(), jnp.array([0.3, -0.2]), jnp.array([0.5])
+    held = mpc.holding(problem, 2.0)
+    added = float(held.running_cost(x, u) - problem.running_cost(x, u))
+    assert added == pytest.approx(2.0 * DT * float(problem.terminal_cost(x)), rel=1e-5)
+    assert mpc.holding(problem, 0.0) is problem
+
+
+def test_a_thread_plans_beside_the_loop(policy):
+    x = np.array([0.5, 0.0])
+    with Background(policy) as newest:
+        for k in range(40):
+            x = stepped(x, newest(x, k * DT))
+            time.sleep(0.02)
+    assert policy.statistics.plans > 3
+    assert np.abs(x).max() < 0.1
+
+
+def test_an_error_in_the_thread_reaches_the_caller(policy, monkeypatch):
+    def fail(x, t):
+        raise ValueError("no")
+
+    monkeypatch.setattr(policy, "plan", fail)
+
+    def call():
+        for k in range(200):
+            newest([0.5, 0.0], k * DT)
+            time.sleep(0.01)
+
+    with Background(policy) as newest, pytest.raises(RuntimeError, match="thread has failed"):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"chains": 0}, "chains is 0"),
+        ({"iterations": 0}, "iterations is 0"),
+        ({"iterations": 99}, "the solver's tail has 60"),
+        ({"explorers": 8}, "explorers is 8 of 8 chains"),
+        ({"hold": -1.0}, "hold is -1"),
+        ({"every": 0.5}, "every is 0.5"),
+        ({"solver": Langevin(preconditioner=Identity())}, "Identity, which brings no feedback"),
+    ],
+)
+def test_settings_that_are_refused(settings, words):
+    with pytest.raises(DraxError, match=words):
+        MPC(balance(), **settings)
+
+
+def test_bounds_that_change_along_the_horizon_are_refused():
+    problem = balance()
+    tighter = replace(problem.bounds, u_upper=jnp.linspace(1.0, 0.5, K)[:, None])
+    with pytest.raises(DraxError, match="differ from knot to knot"):
+        MPC(replace(problem, bounds=tighter))
+
+
+def test_a_policy_without_a_plan_says_what_to_do():
+    with pytest.raises(DraxError, match=r"call policy.reset\(x\)"):
+        MPC(balance()).control([0.0, 0.0], 0.0)
+
+
+@pytest.fixture(scope="module")
+def slider():
+    return from_mjcf(
+        SLIDER,
+        horizon=0.5,
+        dt=0.02,
+        terminal_residual=lambda data: jnp.concatenate([5.0 * data.qpos, data.qvel]),
+        running_residual=lambda data, u: 0.1 * u,
+        goal=lambda data: abs(data.qpos[0]) < 0.02 and abs(data.qvel[0]) < 0.1,
+    )
+
+
+def test_the_plant_is_pushed_heavier_and_noisy(slider):
+    push = Push(0.02, "cart", (5.0, 0.0, 0.0), lasts=0.05)
+    light, heavy = Plant(slider, pushes=[push]), Plant(slider, mass=2.0, pushes=[push])
+    for plant in (light, heavy):
+        while plant.time < 0.2:
+            plant.step(np.zeros(1))
+    assert light.data.qvel[0] == pytest.approx(5.0 * 0.05, rel=1e-6)
+    assert heavy.data.qvel[0] == pytest.approx(5.0 * 0.05 / 2.0, rel=1e-6)
+    assert slider.dynamics.mj_model.body_mass[1] == 1.0
+    np.testing.assert_array_equal(light.measured(), light.state)
+    noisy = Plant(slider, noise=0.1, shaking=1.0, seed=1)
+    off = np.array([noisy.measured() - noisy.state for _ in range(400)])
+    np.testing.assert_allclose(off.std(0), 0.1, rtol=0.15)
+    noisy.step(np.zeros(1))
+    assert noisy.data.qvel[0] != 0.0
+
+
+def test_a_push_on_no_body_and_a_mass_of_nothing_are_refused(slider):
+    with pytest.raises(DraxError, match="has no body 'leg'"):
+        Plant(slider, pushes=[Push(0.0, "leg", (1.0, 0.0, 0.0))])
+    with pytest.raises(DraxError, match="mass is 0"):
+        Plant(slider, mass=0.0)
+    with pytest.raises(DraxError, match="no model to simulate"):
+        Plant(balance())
+
+
+def test_random_pushes_are_spread_over_time(slider):
+    pushes = random_pushes(slider, 3, 2.0, (1.0, 4.0), seed=5)
+    assert [1 <= p.time - i <= 2 for i, p in enumerate(pushes)] == [True] * 3
+    assert {abs(p.force[0]) for p in pushes} == {20.0}  # 2 m/s for 1 kg in 0.1 s
+
+
+def test_trials_in_the_loop_recover_and_are_summed_up(slider):
+    policy = MPC(slider, chains=2, explorers=0, hold=1.0, solver=FAST)
+    policy.reset(slider.x_init)
+    trials = loop.Trials(policy, 5.5, False).run(2, 1, 1.0, mass=1.2)
+    numbers = trials.summary()
+    assert numbers["success_rate"] == 1.0
+    assert numbers["plans_per_s"] > 0.0
+    assert set(numbers["latency_s"]) == {"p50", "p90", "p99"}
+    assert numbers["cost"] > 0.0
+    json.dumps(numbers)
+    assert "2 of 2 end in the goal" in "\n".join(loop.lines(numbers))
+    with pytest.raises(DraxError, match="leaves no time for pushes"):
+        loop.Trials(policy, 2.0, False).run(1, 1, 1.0)
+    policy.rewind()
+    motion = loop.simulate(policy, Plant(slider), 0.4, realtime=True)
+    assert motion.states.shape == (41, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [[], ["--async"]])
+def test_a_cartpole_swings_up_and_bears_pushes(mode, tmp_path, capsys):
+    status = main(
+        ["mpc", "cartpole", "--chains", "4", "--runs", "2", "--out", str(tmp_path), *mode]
+    )
+    numbers = json.loads((tmp_path / "mpc.json").read_text())
+    assert "plans/s" in capsys.readouterr().out
+    assert numbers["runs"] == 2
+    assert numbers["horizon"] == 100
+    if not mode:  # in real time it depends on the computer
+        assert status == 0
+        assert numbers["success_rate"] == 1.0
+
+
+def test_the_command_refuses_before_it_compiles(capsys):
+    assert main(["mpc", "cartpole", "--mass", "0"]) == 2
+    assert "mass is 0" in capsys.readouterr().err
+    assert main(["mpc", "cartpole", "--pushes", "-1"]) == 2
+    assert main(["mpc", "bug_trap"]) == 2
+    assert "no model to simulate" in capsys.readouterr().err
