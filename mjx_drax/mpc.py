@@ -228,7 +228,7 @@ class MPC:
         """
         problem = checked(self.problem.with_x_init(np.asarray(x, float)))
         clock = time.perf_counter()
-        found = run(problem, self.chains, self.seed, self.solver)
+        found = run(problem, self.chains, self.seed, self.solver, devices=1)
         unit = unit_of(np.asarray(found.records[0][1].cost))
         if isinstance(self.solver, Restarts):
             self._flow = self.solver.first(unit)
