@@ -128,7 +128,8 @@ def test_funnels_lead_through_the_gates():
     """In a gate's plane only its middle is free; far from it all is."""
     for gate, middle in enumerate(GATES):
         for off, inside in ((0.0, True), (0.9 * OPEN, True), (1.1 * OPEN, False)):
-            data = SimpleNamespace(qpos=np.concatenate([[*middle, 0.0, 0.0, off], [1, 0, 0, 0]]))
+            position = np.add(middle, [0.0, 0.0, off])
+            data = SimpleNamespace(qpos=np.append(position, [1, 0, 0, 0]))
             assert (np.asarray(funnels(data, None))[gate] <= 0) == inside
     data = SimpleNamespace(qpos=np.array([0.0, 2.0, 3.0, 1, 0, 0, 0]))
     assert (np.asarray(funnels(data, None)) < 0).all()
