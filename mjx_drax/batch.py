@@ -25,16 +25,25 @@ from jax.typing import ArrayLike
 
 from mjx_drax.devices import SPLIT, mesh_for, spread
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking
 from mjx_drax.problem import Problem, Trajectory, checked
-from mjx_drax.restarts import MORE, Restarts, finished, initial_knots, level, unit_of
+from mjx_drax.restarts import (
+    MORE,
+    Restarts,
+    as_restarts,
+    finished,
+    initial_knots,
+    level,
+    unit_of,
+)
 from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Replays, judged
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
 
 COPIES = 40
-"""Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes."""
+"""Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes. An
+estimate on the safe side, not a measurement."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +81,6 @@ class Family:
 
         first, last = checked(nth(0)), nth(count - 1)
         leaves, others = jax.tree.leaves(first), jax.tree.leaves(last)
-        if count == 1:  # nothing to compare with: what a second make leaves as it is, is shared
-            others = jax.tree.leaves(nth(0))
         if len(leaves) != len(others):
             raise DraxError("make gives problems of different structure: vary numbers only.")
         differs = tuple(a is not b for a, b in zip(leaves, others, strict=True))
@@ -218,17 +225,13 @@ def solve_batch(
         DraxError: as `solve`; values without a common first axis; a model that varies, which the C
             engine would not replay.
     """
-    solver = solver or Restarts()
-    if not isinstance(chains, int | np.integer) or chains < 1:
-        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
-    family = Family.of(make, values)
-    solver.check(family.at(0))
-    if isinstance(solver, Langevin):
-        solver = Restarts(solver, descent=None, attempts=1)
-    size = min(chunk or fitting(family.at(0), chains), family.count)
-    if size < 1:
+    if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
         raise DraxError(f"chunk is {chunk!r}: give a whole number of at least 1.")
-    search = _Search(family, int(chains), seed, solver, size, mesh_for(size, devices))
+    family = Family.of(make, values)
+    first = family.at(0)
+    solver = as_restarts(first, chains, seed, solver or Restarts())
+    size = min(chunk or fitting(first, chains), family.count)
+    search = _Search(family, chains, seed, solver, size, mesh_for(size, devices))
     clock = time.perf_counter()
     search.run(progress)
     return search.solution(time.perf_counter() - clock - search.compile_time)
@@ -346,8 +349,8 @@ class _Search:
     def solution(self, solve_time: float) -> BatchSolution:
         """The best chain of every problem, replayed."""
         clock = time.perf_counter()
-        feasible = self.defect < FEASIBLE
-        order = np.lexsort((np.where(feasible, self.cost, self.defect), ~feasible), axis=1)
+        infeasible, value = ranking(self.cost, self.defect)
+        order = np.lexsort((value, infeasible), axis=1)
         rows, best = np.arange(self.family.count), order[:, 0]
         x, u, gains = (array[rows, best] for array in (self.x, self.u, self.gains))
         start = np.broadcast_to(self.family.problem.x_init, (len(rows), x.shape[-1]))

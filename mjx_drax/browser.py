@@ -30,12 +30,14 @@ import numpy.typing as npt
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError
 from mjx_drax.files import complete, require
-from mjx_drax.host import set_state
+from mjx_drax.host import finite, set_state
 from mjx_drax.painter import Mesh, color, mesh_of, model_mesh, primitive
 from mjx_drax.solution import OPEN_LOOP, TRACKED, Solution
 
 if TYPE_CHECKING:
     import viser
+
+    from mjx_drax.problem import Problem
 
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -59,13 +61,12 @@ _BANNER = """\
 </style>"""
 
 
-def require_viewer(solution_or_problem: Any) -> None:
+def require_viewer(problem: Problem) -> None:
     """Complain about what `save_html` could not show; call it before a long computation.
 
     Raises:
         DraxError: viser is missing, or the problem has no model.
     """
-    problem = getattr(solution_or_problem, "problem", solution_or_problem)
     if not hasattr(problem.dynamics, "mj_model"):
         raise DraxError(
             f"{problem.name} has no MuJoCo model to show in a browser, its dynamics are a "
@@ -88,7 +89,7 @@ def save_html(solution: Solution, path: str | os.PathLike[str], ghosts: int = GH
         DraxError: viser is not installed, the problem has no model, a number of ghosts below 0, or
             a path that cannot be written.
     """
-    require_viewer(solution)
+    require_viewer(solution.problem)
     if not isinstance(ghosts, int | np.integer) or ghosts < 0:
         raise DraxError(f"ghosts is {ghosts!r}: give a whole number of at least 0.")
     with complete(path, (".html", ".htm")) as partial:
@@ -170,10 +171,11 @@ Motion = tuple[Floats, Floats]
 def _motion(model: mujoco.MjModel, states: Floats) -> Motion:
     """Where the bodies are, for states (K+1, nx) up to the first that is not finite."""
     data = mujoco.MjData(model)
-    count = int(np.cumprod(np.isfinite(states).all(axis=1)).sum())
+    states = finite(states)
+    count = len(states)
     positions, turns = np.empty((count, model.nbody, 3)), np.empty((count, model.nbody, 4))
-    for k in range(count):
-        set_state(model, data, states[k])
+    for k, x in enumerate(states):
+        set_state(model, data, x)
         mujoco.mj_kinematics(model, data)
         positions[k], turns[k] = data.xpos, data.xquat
     return positions, turns

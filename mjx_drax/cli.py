@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from mjx_drax.errors import DraxError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from tqdm import tqdm
 
     from mjx_drax.langevin import Info, Langevin
@@ -379,8 +381,7 @@ def _mpc(options: argparse.Namespace) -> int:
 
     if options.pushes < 0:
         raise DraxError(f"--pushes is {options.pushes}: give a number of at least 0.")
-    task = tasks.load(options.task)
-    problem = task.make() if options.horizon is None else task.make(horizon=options.horizon)
+    problem = _made(tasks.load(options.task), options.horizon)
     names = ("chains", "explorers", "iterations", "every", "hold", "seed")
     policy = MPC(problem, **{name: getattr(options, name) for name in names})
     duration = options.duration or float(problem.times[-1]) + 8.0
@@ -565,13 +566,17 @@ def _task(options: argparse.Namespace) -> Asked:
             f"both the task {options.task!r} and --model or --cost are given: choose one."
         )
     task = tasks.load(options.task)
-    problem = task.make() if options.horizon is None else task.make(horizon=options.horizon)
+    problem = _made(task, options.horizon)
     return problem, Restarts(), getattr(task, "CHAINS", 64), getattr(task, "draw", None)
 
 
-def _own_problem(
-    options: argparse.Namespace,
-) -> Asked:
+def _made(task: ModuleType, horizon: float | None) -> Problem:
+    """A task's problem, over its own horizon or one of so many seconds."""
+    problem: Problem = task.make() if horizon is None else task.make(horizon=horizon)
+    return problem
+
+
+def _own_problem(options: argparse.Namespace) -> Asked:
     """The same for the user's own model and cost file."""
     if not (options.model and options.cost):
         raise DraxError("give a task (see `mjx-drax list`), or both --model XML and --cost PY.")

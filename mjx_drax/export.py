@@ -20,6 +20,7 @@ from mjx_drax._mujoco import mujoco
 from mjx_drax.dynamics import Dynamics
 from mjx_drax.errors import DraxError
 from mjx_drax.files import complete, require
+from mjx_drax.problem import Problem
 from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
 
 DATASET_FORMAT = 1
@@ -109,13 +110,12 @@ def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
 # Keyframes
 
 
-def require_mjcf(solution_or_problem: Any) -> None:
+def require_mjcf(problem: Problem) -> None:
     """Complain about a problem whose model cannot be written as MJCF; call it before a solve.
 
     Raises:
         DraxError: the problem has no model, or its MJCF is not known or has changed.
     """
-    problem = getattr(solution_or_problem, "problem", solution_or_problem)
     host = getattr(problem.dynamics, "host", None)
     if host is None:
         raise DraxError(
@@ -140,7 +140,7 @@ def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
     Raises:
         DraxError: there is no MJCF, it has changed since, or the path cannot be written.
     """
-    require_mjcf(solution)
+    require_mjcf(solution.problem)
     target = Path(path).expanduser()
     source = solution.problem.dynamics.host.source()  # type: ignore[attr-defined]
     folder = f"{target.stem}_assets"

@@ -22,7 +22,7 @@ from mjx_drax import movie
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError
 from mjx_drax.ghosts import Stage, places, travelling_body
-from mjx_drax.host import between, interpolated, moved
+from mjx_drax.host import between, finite, interpolated, moved
 from mjx_drax.langevin import FEASIBLE
 from mjx_drax.movie import Frame
 from mjx_drax.recording import Path
@@ -103,8 +103,7 @@ def render_diffusion(
     movie.film_path(path)
     height, width = movie.even(size)
     below = 2 * round(_STRIP * height / 2)
-    states = solution.replayed[0]
-    states = states[: int(np.cumprod(np.isfinite(states).all(axis=1)).sum())]
+    states = finite(solution.replayed[0])
     instants = frame_times(solution.problem.times[: len(states)], fps, speed)
     lines = outcome_lines(solution)
     colors = Colors.of(shown[0])

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mjx_drax import movie
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError
-from mjx_drax.host import interpolated
+from mjx_drax.host import finite, interpolated
 from mjx_drax.rendering import FREE, Floats, open_drawer, set_pose, view_of
 
 if TYPE_CHECKING:
@@ -126,8 +126,7 @@ def render_timelapse(
     if not isinstance(count, int | np.integer) or count < 1:
         raise DraxError(f"count is {count!r}: give a whole number of poses, at least 1.")
     model = model_of(solution)
-    states = solution.replayed[0]
-    qpos = states[np.isfinite(states).all(axis=1)][:, : model.nq]
+    qpos = finite(solution.replayed[0])[:, : model.nq]
     times = solution.problem.times[: len(qpos)]
     view = view_of(model, qpos, FREE if camera is None else camera, width / height)
     at = np.linspace(0.0, times[-1], count)

@@ -14,6 +14,11 @@ from mjx_drax._mujoco import mujoco
 Floats = npt.NDArray[np.floating]
 
 
+def finite(states: Floats) -> Floats:
+    """The states (T, ...) of a replay, up to the first that is not finite."""
+    return states[: int(np.cumprod(np.isfinite(states).all(axis=1)).sum())]
+
+
 def set_state(model: mujoco.MjModel, data: mujoco.MjData, x: Floats) -> None:
     """Write x (nx,) into the C engine's data."""
     data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])

@@ -238,7 +238,7 @@ class Langevin:
             memory=jax.vmap(self.preconditioner.memory, in_axes=(None, 0))(problem, inside),
             key=jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains)),
             alive=jnp.ones(chains, bool),
-            died_at=jnp.full(chains, -1),
+            died_at=jnp.full(chains, -1, int),  # not weakly typed: a second type compiles again
         )
 
     def moved_to(self, problem: Problem, state: State, trajectory: Trajectory) -> State:
@@ -449,6 +449,13 @@ def _keep_finite(old: State, new: State, iteration: Array) -> State:
     kept = jax.tree.map(lambda a, b: jnp.where(_per_chain(alive, a), a, b), after, before)
     died_at = jnp.where(old.alive & ~finite, iteration, old.died_at)
     return replace(new, alive=alive, died_at=died_at, **kept)
+
+
+def ranking(cost: ArrayLike, max_defect: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Sort keys of chains (...,), best first: infeasible, then cost, or max|h| if infeasible."""
+    defect = np.nan_to_num(np.asarray(max_defect), nan=np.inf)
+    infeasible = defect >= FEASIBLE
+    return infeasible, np.where(infeasible, defect, np.asarray(cost))
 
 
 @jax.jit

@@ -35,7 +35,8 @@ from jax.tree_util import Partial, register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, State, evaluate
+from mjx_drax.host import difference, integrate
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, State, evaluate, ranking
 from mjx_drax.linalg import exact
 from mjx_drax.precondition import GaussNewton
 from mjx_drax.problem import Cost, Problem, Stagewise, Trajectory, checked
@@ -324,16 +325,12 @@ class MPC:
         dynamics: Any = self.problem.dynamics
         if dynamics.nx == dynamics.ndx:
             return x - y
-        from mjx_drax.host import difference
-
         return difference(dynamics.mj_model, x, np.asarray(y, float))
 
     def _between(self, x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
         """The state (nx,) a share of the way from x to y, on the host."""
         if self.problem.dynamics.nx == self.problem.dynamics.ndx:
             return np.asarray(x + share * (y - x))
-        from mjx_drax.host import integrate
-
         dynamics: Any = self.problem.dynamics
         x = np.asarray(x, float)
         return integrate(dynamics.mj_model, x, share * self._difference(np.asarray(y, float), x))
@@ -373,14 +370,11 @@ def _held_residual(
 
 def _first(state: State, info: Info, explorers: int, seed: int) -> Carried:
     """The chains of a solve, the best ones as keepers; the explorers at all ages."""
-    infeasible = ~(np.asarray(info.max_defect) < FEASIBLE)
-    rank = np.where(infeasible, np.asarray(info.max_defect), np.asarray(info.cost))
-    chains = len(rank)
+    chains = len(info.cost)
     count = chains - explorers
     age = np.zeros(chains, np.int32)
     age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
-    order = np.lexsort((rank, infeasible))
-    state = replace(state, died_at=jnp.full(chains, -1, jnp.int32))  # not weakly typed
+    order = np.lexsort(ranking(info.cost, info.max_defect)[::-1])
     return Carried(
         _rows(state, order),
         jnp.int32(0),

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.errors import DraxError
+from mjx_drax.host import finite
 from mjx_drax.langevin import FEASIBLE
 from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
 
@@ -173,8 +174,7 @@ def _title(solution: Solution) -> str:
 
 def _draw_scene(axes: Axes, solution: Solution, draw: Draw) -> None:
     """The replayed motion among its surroundings, as the task draws it."""
-    states = solution.replayed[0]
-    draw(axes, states[np.isfinite(states).all(axis=1)])
+    draw(axes, finite(solution.replayed[0]))
     axes.set_title("replayed motion", loc="left", fontsize=9, fontweight="bold")
     axes.tick_params(labelsize=8)
     for axis in (axes.xaxis, axes.yaxis):

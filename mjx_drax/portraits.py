@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError
-from mjx_drax.host import between
+from mjx_drax.host import between, finite
 from mjx_drax.plotting import BLUE, DPI, PANELS, VERMILLION, label_panel, save_figure
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
         )
     shown = coordinates(dynamics)[:PANELS]
     plan = np.asarray(solution.problem.with_start(solution.best), float)
-    replay = solution.replayed[0]
-    replay = replay[: int(np.cumprod(np.isfinite(replay).all(axis=1)).sum())]
+    replay = finite(solution.replayed[0])
     columns = min(_COLUMNS, len(shown))
     rows = -(-len(shown) // columns)
     inches = (max(3.2 * columns, 5.2), 2.7 * rows + 0.5)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin
+from mjx_drax.langevin import Info, Langevin, ranking
 from mjx_drax.linalg import exact
 from mjx_drax.problem import Problem, Trajectory
 
@@ -68,16 +68,13 @@ class Tries:
         As solves choose: feasible before infeasible, then the cheaper or the less infeasible.
         None if no place worked for it.
         """
-        last, places = self.snapshots[-1], np.flatnonzero(self.owners == chain)
-        defect = np.nan_to_num(last.max_defect, nan=np.inf)
-        ranks = [
-            (bool(defect[p] >= FEASIBLE), float((last.cost if defect[p] < FEASIBLE else defect)[p]))
-            for p in places
-        ]
-        if not ranks:
+        places = np.flatnonzero(self.owners == chain)
+        if not len(places):
             return None
-        first = min(range(len(ranks)), key=ranks.__getitem__)
-        return int(places[first]), ranks[first]
+        last = self.snapshots[-1]
+        infeasible, value = ranking(last.cost, last.max_defect)
+        place = int(places[np.lexsort((value[places], infeasible[places]))[0]])
+        return place, (bool(infeasible[place]), float(value[place]))
 
 
 @dataclass(frozen=True)

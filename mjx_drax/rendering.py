@@ -29,7 +29,7 @@ import numpy.typing as npt
 from mjx_drax import movie
 from mjx_drax._mujoco import APT_EGL, mujoco
 from mjx_drax.errors import DraxError
-from mjx_drax.host import interpolated
+from mjx_drax.host import finite, interpolated
 from mjx_drax.movie import Frame
 
 if TYPE_CHECKING:
@@ -87,9 +87,8 @@ def render(
     """
     problem = solution.problem
     model = getattr(problem.dynamics, "mj_model", None)
-    states = solution.replayed[0]
-    shown = int(np.cumprod(np.isfinite(states).all(axis=1)).sum())
-    states, times, overlay = states[:shown], problem.times[:shown], outcome_lines(solution)
+    states = finite(solution.replayed[0])
+    times, overlay = problem.times[: len(states)], outcome_lines(solution)
     if model is not None:
         qpos = states[:, : model.nq]
         return render_motion(

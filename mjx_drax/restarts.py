@@ -46,6 +46,7 @@ from mjx_drax.langevin import (
     State,
     advance,
     evaluate,
+    ranking,
 )
 from mjx_drax.problem import Problem, Trajectory
 from mjx_drax.recording import Recorder, knot_defects
@@ -193,9 +194,17 @@ def run(
     recorder: Recorder | None = None,
     devices: int | None = None,
 ) -> Run:
-    """The iterations of `solve`, for problems that need no replay; the same arguments.
+    """The iterations of `solve`, for problems that need no replay; the same arguments."""
+    solver = as_restarts(problem, chains, seed, solver)
+    mesh = mesh_for(chains, devices)
+    return _Search(problem, chains, seed, guess, progress, recorder, mesh).run(solver)
 
-    A `Langevin` is one attempt with its schedules as they stand.
+
+def as_restarts(problem: Problem, chains: int, seed: int, solver: Langevin | Restarts) -> Restarts:
+    """The solver, of which a `Langevin` is one attempt with its schedules as they stand.
+
+    Raises:
+        DraxError: a number of chains, seed or setting that cannot work.
     """
     if not isinstance(chains, int | np.integer) or chains < 1:
         raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
@@ -205,9 +214,8 @@ def run(
         raise DraxError(f"solver is {solver!r}: give a Langevin or a Restarts.")
     solver.check(problem)
     if isinstance(solver, Langevin):
-        solver = Restarts(solver, descent=None, attempts=1)
-    mesh = mesh_for(chains, devices)
-    return _Search(problem, chains, seed, guess, progress, recorder, mesh).run(solver)
+        return Restarts(solver, descent=None, attempts=1)
+    return solver
 
 
 class _Search:
@@ -462,11 +470,9 @@ def _best(kept: Attempt, found: Attempt, owners: np.ndarray) -> Attempt:
     def both(values: Callable[[Attempt], ArrayLike]) -> np.ndarray:
         return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
 
-    feasible = both(lambda a: a.feasible)
-    defect = np.nan_to_num(both(lambda a: a.info.max_defect), nan=np.inf)
-    rank = np.where(feasible, both(lambda a: a.info.cost), defect)
+    infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
     of = np.concatenate([np.arange(chains), owners])
-    order = np.lexsort((rank, ~feasible, of))
+    order = np.lexsort((value, infeasible, of))
     source = order[np.unique(of[order], return_index=True)[1]]
     state, info = _gather((kept.state, kept.info), (found.state, found.info), source)
     return Attempt(state, info, both(lambda a: a.converged_at)[source])

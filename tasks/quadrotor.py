@@ -12,9 +12,9 @@ from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax import Problem, Terms, Trajectory, from_mjcf, guesses
-from mjx_drax.dynamics import Dynamics
 from mjx_drax.mjcf import load
 from mjx_drax.models import path
+from mjx_drax.precondition import displaced
 
 DT = 0.04  # [s]
 GOAL = np.array([2.5, 0.0, 1.0])  # [m]
@@ -24,10 +24,8 @@ SIDES = ("left", "right", "below", "above")
 BARS = ["pillar", *(f"{gate}_{side}" for gate in ("first", "second") for side in SIDES)]
 GATES = np.array([[-1.2, 0.6, 1.4], [1.2, -0.6, 0.9]])  # their middles [m]
 SCATTER = 0.2  # of initial knots about the way [m, rad, m/s, rad/s, N]
-OPEN, DEPTH = (
-    0.15,
-    0.3,
-)  # how far from its middle a gate is passed, and how deep its funnels are [m]
+OPEN = 0.15  # how far from its middle a gate may be passed [m]
+DEPTH = 0.3  # of the funnels before and behind a gate [m]
 
 
 def make(horizon: float = 4.0) -> Problem:
@@ -48,7 +46,7 @@ def make(horizon: float = 4.0) -> Problem:
         ),
         name="quadrotor",
     )
-    guess = Partial(about, problem.dynamics, through_gates(problem))
+    guess = Partial(about, problem, through_gates(problem))
     return replace(problem, aside=replace(problem.aside, guess=guess))
 
 
@@ -61,12 +59,12 @@ def through_gates(problem: Problem) -> Trajectory:
     return guesses.waypoints(problem, zip(times, poses, strict=True))
 
 
-def about(dynamics: Dynamics, along: Trajectory, key: Array) -> Trajectory:
+def about(problem: Problem, along: Trajectory, key: Array) -> Trajectory:
     """Knots scattered about a trajectory."""
     key_x, key_u = jax.random.split(key)
-    away = SCATTER * jax.random.normal(key_x, (len(along.x), dynamics.ndx))
+    away = SCATTER * jax.random.normal(key_x, (problem.horizon, problem.dynamics.ndx))
     push = SCATTER * jax.random.normal(key_u, along.u.shape)
-    return Trajectory(jax.vmap(dynamics.integrate)(along.x, away), along.u + push)
+    return displaced(problem, along, Trajectory(away, push))
 
 
 def effort(data: Any, u: Array) -> Array:

@@ -154,6 +154,8 @@ def test_models_are_replayed_by_the_c_engine():
         (np.zeros((0, 2)), {}, "first axis"),
         (STARTS, {"chains": 0}, "chains is 0"),
         (STARTS, {"chunk": -1}, "chunk is -1"),
+        (STARTS, {"chunk": 0}, "chunk is 0"),
+        (STARTS, {"seed": -1}, "seed is -1"),
         (np.zeros((3, 5)), {}, "x_init has shape"),
     ],
 )
