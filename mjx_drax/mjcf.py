@@ -6,9 +6,9 @@ The same model is stepped by MuJoCo's C engine, in float64, when a result is cer
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from mujoco.rollout import Rollout
 from numpy.typing import ArrayLike
 
 from mjx_drax import agreement, physics
@@ -47,6 +48,11 @@ from mjx_drax.twin import driven, free_ranges, has_constraints, twin
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
 take several times as many, and compilers need minutes for tens of thousands."""
+
+
+CHAINS_PER_THREAD = 8
+"""Chains that a thread replays. To wait for each other at every knot costs threads more than a few
+steps do: of 64 chains of a hopper on two cores, 64 threads took five times as long as one."""
 
 
 class HostModel:
@@ -230,36 +236,63 @@ class MjxDynamics(Dynamics):
         gains: np.ndarray,
         limits: tuple[np.ndarray, np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`."""
+        """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`.
+
+        All chains take a knot at a time. At each knot the constraint solver starts afresh, so that
+        x_{k+1} depends on x_k and u_k alone; `mj_step` in a loop starts it from the last knot's
+        forces, and differs by the solver's tolerance.
+        """
+        model = copy.copy(self.mj_model)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # to be seen below
         lower, upper = (np.broadcast_to(side, u.shape[1:]) for side in limits)
+        chains, knots = u.shape[:2]
+        states, applied = np.full(plan.shape, np.nan), np.full(u.shape, np.nan)
+        states[:, 0] = plan[:, 0]
+        threads = min(-(-chains // CHAINS_PER_THREAD), os.cpu_count() or 1)
+        models, workers = [model] * chains, [mujoco.MjData(model) for _ in range(threads)]
+        start = np.empty(mujoco.mj_stateSize(model, _PHYSICS))
+        mujoco.mj_getState(model, workers[0], start, _PHYSICS)
+        time, x = 0, slice(1, 1 + self.nx)
+        now, sound = np.tile(start, (chains, 1)), np.ones(chains, bool)
+        now[:, x] = plan[:, 0]
+        steps = np.empty((chains, self.substeps, len(start)))
+        with _no_log_file(), Rollout(nthread=threads if threads > 1 else 0) as engine:
+            for k in range(knots):
+                off = self._differences(states[:, k], plan[:, k])
+                wanted = u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off)
+                applied[:, k] = np.clip(wanted, lower[k], upper[k])
+                sound &= (np.abs(applied[:, k]) < mujoco.mjMAXVAL).all(axis=1)
+                applied[~sound, k] = np.nan
+                now[~sound] = start  # something harmless, which nobody looks at
+                control = np.where(sound[:, None], applied[:, k], 0.0)
+                engine.rollout(
+                    models,
+                    workers,
+                    now,
+                    np.repeat(control[:, None], self.substeps, axis=1),
+                    nstep=self.substeps,
+                    state=steps,
+                    chunk_size=-(-chains // threads),
+                    skip_checks=True,
+                )
+                now = steps[:, -1].copy()
+                sound &= (np.abs(now) < mujoco.mjMAXVAL).all(axis=1)
+                # After a warning the engine takes no further step
+                sound &= now[:, time] > (k + 1) * self.dt - 0.5 * model.opt.timestep
+                states[sound, k + 1] = now[sound, x]
+        return states, applied
 
-        def chain(c: int) -> tuple[np.ndarray, np.ndarray]:
-            model, data = self.mj_model, mujoco.MjData(self.mj_model)
-            states, applied = np.empty(plan.shape[1:]), np.empty(u.shape[1:])
-            states[0] = plan[c, 0]
-            set_state(model, data, states[0])
-            for k in range(len(applied)):
-                wanted = u[c, k] + gains[c, k] @ difference(model, states[k], plan[c, k])
-                applied[k] = data.ctrl[:] = np.clip(wanted, lower[k], upper[k])
-                mujoco.mj_step(model, data, self.substeps)
-                if any(data.warning[w].number for w in _BLOWN_UP):  # the engine reset itself
-                    states[k + 1 :] = applied[k:] = np.nan
-                    break
-                states[k + 1] = np.concatenate([data.qpos, data.qvel, data.act])
-            return states, applied
-
-        with _no_log_file(), ThreadPoolExecutor(os.cpu_count()) as pool:
-            runs = list(pool.map(chain, range(len(u))))
-        return np.stack([run[0] for run in runs]), np.stack([run[1] for run in runs])
+    def _differences(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """x - y in tangent space, (n, ndx), for states (n, nx)."""
+        if self.nx == self.ndx:
+            return x - y
+        return np.stack([difference(self.mj_model, *pair) for pair in zip(x, y, strict=True)])
 
     def deviation(self, states: np.ndarray, plan: np.ndarray) -> np.ndarray:
         """max|x - plan| in tangent space, (...,) for states and plan of shape (..., nx)."""
-        if self.nx == self.ndx:
-            return super().deviation(states, plan)
-        off = np.empty((*states.shape[:-1], self.ndx))
-        for i in np.ndindex(states.shape[:-1]):
-            off[i] = difference(self.mj_model, states[i], plan[i])
-        return np.abs(off).max(axis=-1)
+        plan = np.broadcast_to(plan, states.shape)
+        off = self._differences(*(a.reshape(-1, self.nx) for a in (states, plan)))
+        return np.abs(off).max(axis=-1).reshape(states.shape[:-1])
 
     def observe_replayed(self, x: np.ndarray) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
@@ -286,15 +319,8 @@ def _unflatten(static: tuple[Any, ...], traced: Iterable[Any]) -> MjxDynamics:
 jax.tree_util.register_pytree_node(MjxDynamics, _flatten, _unflatten)
 
 
-_BLOWN_UP = [
-    int(warning)
-    for warning in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-        mujoco.mjtWarning.mjWARN_BADCTRL,
-    )
-]
+_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
+"""What a step starts from: the time, the state, and what actuators and plugins remember."""
 
 
 @contextlib.contextmanager

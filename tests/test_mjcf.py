@@ -10,6 +10,7 @@ import pytest
 
 from mjx_drax import DraxError, Trajectory, from_mjcf
 from mjx_drax.derivatives import Autodiff
+from mjx_drax.host import difference, set_state
 from mjx_drax.langevin import evaluate
 from mjx_drax.linearize import linearize
 from mjx_drax.models import path
@@ -367,3 +368,37 @@ def test_another_initial_state_is_checked_too():
         task.with_x_init([9.0, 0, 0, 0, 0])
     with pytest.raises(DraxError, match="x_init"):
         task.with_x_init([0.1])
+
+
+BALL = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 0.15"><freejoint/><geom size="0.1"/></body>
+<body pos="0 1 1"><joint name="j" axis="1 0 0"/>
+<geom type="capsule" size="0.05" fromto="0 0 0 0 0 -0.5"/></body></worldbody>
+<actuator><motor joint="j"/></actuator></mujoco>"""
+
+
+def test_replays_are_those_of_the_c_engine_and_a_chain_that_blows_up_leaves_others_alone():
+    dynamics = from_mjcf(BALL, horizon=0.4, dt=0.02, running_residual=lambda data, u: u).dynamics
+    model, rng, chains, K = dynamics.mj_model, np.random.default_rng(0), 20, 20
+    x0 = np.concatenate([model.qpos0, np.zeros(model.nv)])
+    plan = np.broadcast_to(x0, (chains, K + 1, len(x0))).copy()
+    plan[:, 0, 2] += rng.uniform(0, 0.1, chains)  # the ball falls on the plane
+    plan[:, 0, 8:] = rng.normal(size=(chains, 7))
+    u = rng.normal(size=(chains, K, 1))
+    gains = 0.1 * rng.normal(size=(chains, K, 1, dynamics.ndx))
+    plan[7, 0, 8] = 5e10  # more than the engine takes
+    limits = (np.array([-0.5]), np.array([0.5]))
+    states, applied = dynamics.replay(plan, u, gains, limits)
+    assert np.isnan(states[7, 1:]).all()
+    sound = [c for c in range(chains) if c != 7]
+    for c in sound:
+        data = mujoco.MjData(model)
+        set_state(model, data, plan[c, 0])
+        for k in range(K):
+            off = difference(model, states[c, k], plan[c, k])
+            data.ctrl[:] = np.clip(u[c, k] + gains[c, k] @ off, *limits)
+            np.testing.assert_allclose(applied[c, k], data.ctrl, atol=1e-12)
+            mujoco.mj_step(model, data, dynamics.substeps)
+            x = np.concatenate([data.qpos, data.qvel])
+            np.testing.assert_allclose(states[c, k + 1], x, atol=1e-6)
+    assert states[sound, -1, 2].min() < 0.11  # it lies on the plane
