@@ -25,7 +25,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.devices import SPLIT, mesh_for, spread
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking
+from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking, worth
 from mjx_drax.problem import Problem, Trajectory, checked
 from mjx_drax.restarts import (
     MORE,
@@ -306,7 +306,7 @@ class _Search:
             cost, noise = (np.broadcast_to(s, len(indices)) for s in (scale.cost, scale.noise))
         elif attempt == 0:
             flow = solver.first(1.0)
-            costs = np.asarray(_evaluated(some, knots).cost)
+            costs = np.asarray(_worth(some, knots)[0])
             self.unit[indices] = [unit_of(row) for row in costs]
             cost, noise = self.unit[indices], np.zeros(len(indices))
         else:
@@ -380,9 +380,9 @@ def _drawn(chains: int, problem: Problem, key: Array) -> Trajectory:
 
 
 @jax.jit
-def _evaluated(family: Family, knots: Trajectory) -> Info:
-    """Cost, max|h| and bound violation of every chain of every problem, (N, chains)."""
-    return family.over(evaluate)(family.problem, knots)
+def _worth(family: Family, knots: Trajectory) -> tuple[Array, Array]:
+    """Cost and bound violation of every chain of every problem, (N, chains)."""
+    return family.over(worth)(family.problem, knots)
 
 
 @partial(jax.jit, static_argnames=("tail", "mesh"))
@@ -433,8 +433,8 @@ def _replayed(family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     else:
         ran = first.replay(plan, u, gains)
 
-    def evaluated(knots: Trajectory) -> Info:
-        info = _evaluated(family, jax.tree.map(lambda a: a[:, None], knots))
-        return jax.tree.map(lambda a: a[:, 0], info)
+    def worth_of(knots: Trajectory) -> tuple[Array, Array]:
+        cost, outside = _worth(family, jax.tree.map(lambda a: a[:, None], knots))
+        return cost[:, 0], outside[:, 0]
 
-    return judged(first, plan, ran, evaluated)
+    return judged(first, plan, ran, worth_of)

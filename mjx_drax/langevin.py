@@ -469,6 +469,13 @@ def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     return jax.vmap(one)(trajectory)
 
 
+@jax.jit
+@exact
+def worth(problem: Problem, trajectory: Trajectory) -> tuple[Array, Array]:
+    """Cost and bound violation of a batch of trajectories: `evaluate` without compiling f."""
+    return jax.vmap(lambda z: (problem.cost(z), problem.bounds.violation(z)))(trajectory)
+
+
 @partial(jax.jit, static_argnames="tail")
 @exact
 def advance(

@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from mjx_drax.errors import DraxError
-from mjx_drax.langevin import FEASIBLE, Info, Langevin, evaluate, feedback_gains
+from mjx_drax.langevin import FEASIBLE, Langevin, feedback_gains, worth
 from mjx_drax.precondition import GaussNewton, Multipliers
 from mjx_drax.problem import Problem, Trajectory, checked
 from mjx_drax.recording import Recorder, Recording
@@ -357,14 +358,14 @@ def _replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> R
     """Every chain's controls, applied from x_0 with the given feedback gains."""
     plan = np.asarray(problem.with_start(trajectories), float)
     ran = problem.replay(plan, trajectories.u, gains)
-    return judged(problem, plan, ran, partial(evaluate, problem))
+    return judged(problem, plan, ran, partial(worth, problem))
 
 
 def judged(
     problem: Problem,
     plan: np.ndarray,
     ran: tuple[np.ndarray, np.ndarray],
-    evaluated: Callable[[Trajectory], Info],
+    worth_of: Callable[[Trajectory], tuple[Array, Array]],
 ) -> Replays:
     """What replays are worth.
 
@@ -372,22 +373,23 @@ def judged(
         problem: for its goal, its state arithmetic and its precision.
         plan: planned states x_0..x_K, (runs, K + 1, nx).
         ran: replayed states, of the same shape, and the controls that were applied (runs, K, nu).
-        evaluated: gives cost and bound violation of a batch of trajectories.
+        worth_of: gives cost and bound violation of a batch of trajectories.
     """
     states, controls = ran
     off = np.nan_to_num(problem.dynamics.deviation(states, plan), nan=np.inf)
     dtype = problem.x_init.dtype
-    info = evaluated(Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype)))
+    knots = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
+    cost, outside = worth_of(knots)
     ends = zip(states[:, -1], off[:, -1], strict=True)
     reached = [_reached(problem, x, deviation) for x, deviation in ends]
-    violation = np.nan_to_num(np.asarray(info.max_violation), nan=np.inf)
+    violation = np.nan_to_num(np.asarray(outside), nan=np.inf)
     return Replays(
         states=states,
         controls=controls,
         max_deviation=off.max(axis=1),
         final_deviation=off[:, -1],
         max_violation=violation,
-        cost=np.asarray(info.cost),
+        cost=np.asarray(cost),
         success=np.array(reached) & (violation < OUTSIDE),
     )
 
