@@ -497,9 +497,9 @@ class _Search:
         stand = self.stand
         if len(stand.began) == stand.attempt:
             noisy = int(flow.iterations) if flow.sigma(0) > 0.0 else 0
-            self.stand = replace(stand, began=(*stand.began, (stand.done, stand.done + noisy)))
             if self.recorder is not None:
                 self.recorder.begin(stand.owners)
+            self.stand = replace(stand, began=(*stand.began, (stand.done, stand.done + noisy)))
             self._snap(flow)
         return self._flowed(flow, expected) and self._mended(flow, expected)
 
