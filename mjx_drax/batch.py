@@ -23,6 +23,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jax.typing import ArrayLike
 
+from mjx_drax.checkpoint import Checkpoint, digest, facts
 from mjx_drax.devices import SPLIT, mesh_for, spread
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking, worth
@@ -203,6 +204,7 @@ def solve_batch(
     chunk: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     devices: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
 
@@ -218,6 +220,8 @@ def solve_batch(
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
         progress: called with (problems done, of how many) after every chunk.
         devices: how many to spread a chunk over; by default as many of this host's as divide it.
+        checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
+            there, as in `solve`.
 
     Where f has kinks (contacts), chains are not led on along replays as `solve` does.
 
@@ -230,11 +234,12 @@ def solve_batch(
     family = Family.of(make, values)
     first = family.at(0)
     solver = as_restarts(first, chains, seed, solver or Restarts())
-    size = min(chunk or fitting(first, chains), family.count)
+    file = None if checkpoint is None else Checkpoint(checkpoint)
+    size = chunk or (file and file.answered("chunk")) or fitting(first, chains)
+    size = min(size, family.count)
     search = _Search(family, chains, seed, solver, size, mesh_for(size, devices))
-    clock = time.perf_counter()
-    search.run(progress)
-    return search.solution(time.perf_counter() - clock - search.compile_time)
+    search.run(progress, file)
+    return search.solution()
 
 
 def fitting(problem: Problem, chains: int) -> int:
@@ -248,6 +253,10 @@ def fitting(problem: Problem, chains: int) -> int:
     width = problem.dynamics.ndx + problem.dynamics.nu
     each = COPIES * chains * problem.horizon * width**2 * problem.x_init.dtype.itemsize
     return max(1, int(SHARE * free // each))
+
+
+STATE = ("attempt", "start", "todo", "unit", "x", "u", "gains", "cost", "defect", "solve_time")
+"""Attributes of a search that change while it runs."""
 
 
 class _Search:
@@ -264,7 +273,7 @@ class _Search:
     ) -> None:
         self.family, self.chains, self.seed = family, chains, seed
         self.solver, self.size, self.mesh = solver, size, mesh
-        self.compile_time = 0.0
+        self.compile_time = self.solve_time = 0.0
         problem, shape = family.problem, (family.count, chains)
         K, dynamics = problem.horizon, problem.dynamics
         dtype = problem.x_init.dtype
@@ -273,54 +282,94 @@ class _Search:
         self.gains = np.zeros((*shape, K, dynamics.nu, dynamics.ndx), dtype)
         self.cost, self.defect = np.full(shape, np.inf), np.full(shape, np.inf)
         self.unit = np.ones(family.count)
+        self.attempt, self.start, self.todo = 0, 0, np.arange(family.count)
 
     def finished(self, indices: np.ndarray) -> np.ndarray:
         """Which chains of those problems are done, (len(indices), chains)."""
         feasible = self.defect[indices] < FEASIBLE
         return finished(self.cost[indices], feasible, self.solver.within, self.unit[indices])
 
-    def run(self, progress: Callable[[int, int], None] | None) -> None:
+    def run(
+        self, progress: Callable[[int, int], None] | None, checkpoint: Checkpoint | None
+    ) -> None:
         """All attempts; Ctrl-C keeps what there is."""
-        everyone = todo = np.arange(self.family.count)
+        if checkpoint is not None:
+            self._resume(checkpoint)
+        clock, everyone = time.perf_counter() - self.solve_time, np.arange(self.family.count)
         try:
-            for attempt in range(self.solver.attempts):
-                for start in range(0, len(todo), self.size):
-                    part = todo[start : start + self.size]
-                    self._chunk(np.resize(part, self.size), len(part), attempt)
+            while self.attempt < self.solver.attempts:
+                while self.start < len(self.todo):
+                    part = self.todo[self.start : self.start + self.size]
+                    self._chunk(np.resize(part, self.size), len(part))
+                    self.start += len(part)
+                    self.solve_time = time.perf_counter() - clock - self.compile_time
+                    if checkpoint is not None:
+                        checkpoint.save(self._saved)
                     if progress is not None:
-                        progress(len(everyone) - len(todo) + start + len(part), len(everyone))
-                todo = everyone[self.finished(everyone).mean(axis=1) < self.solver.enough]
+                        progress(len(everyone) - len(self.todo) + self.start, len(everyone))
+                self.todo = everyone[self.finished(everyone).mean(axis=1) < self.solver.enough]
                 self.unit[(self.defect >= FEASIBLE).all(axis=1)] *= MORE
-        except KeyboardInterrupt:
-            if not self.compile_time:
+                self.attempt, self.start = self.attempt + 1, 0
+        except KeyboardInterrupt:  # maybe while something was kept: no checkpoint of that
+            if not (self.attempt or self.start):
                 raise
+        else:
+            if checkpoint is not None and self.compile_time:
+                checkpoint.save(self._saved, now=True)
 
-    def _chunk(self, indices: np.ndarray, count: int, attempt: int) -> None:
+    def _resume(self, checkpoint: Checkpoint) -> None:
+        """Go on from the checkpoint, if there is one; complain if it is of another question."""
+        family = self.family
+        known = facts(family.problem, self.chains, self.seed, self.solver, self.mesh)
+        sizes = {"problems": family.count, "chunk": self.size}
+        checkpoint.require({"call": "solve_batch", **sizes, **known})
+        checkpoint.require_room(sum(np.asarray(part).nbytes for part in self._saved().values()))
+        flow, some, scales, knots, keys = self._begun(np.arange(self.size))
+        tail = int(flow.tail) > 0
+        program = _flowed.lower(flow, some, scales, knots, keys, 0, tail, self.mesh)
+        functions = digest(program.as_text())
+        checkpoint.require({"initial knots": digest(knots), "functions": functions})
+        if checkpoint.found is not None:
+            for name, value in checkpoint.restored(self._saved()).items():
+                setattr(self, name, value)
+
+    def _saved(self) -> dict[str, Any]:
+        """What a checkpoint holds: all that the rest of the search depends on."""
+        return {name: getattr(self, name) for name in STATE}
+
+    def _chunk(self, indices: np.ndarray, count: int) -> None:
         """One attempt on some problems; those after the first `count` fill up the chunk."""
-        clock, solver, some = time.perf_counter(), self.solver, self.family.some(indices)
-        key = jax.random.fold_in(jax.random.key(self.seed), attempt)
+        clock = time.perf_counter()
+        flow, *arguments = self._begun(indices)
+        total, tail = int(flow.iterations + flow.tail), int(flow.tail) > 0
+        if not self.compile_time:
+            jax.block_until_ready(_flowed(flow, *arguments, 0, tail, self.mesh))
+            self.compile_time = time.perf_counter() - clock
+        found = _flowed(flow, *arguments, total, tail, self.mesh)
+        self._keep(indices[:count], *jax.tree.map(lambda a: np.asarray(a)[:count], found))
+
+    def _begun(self, indices: np.ndarray) -> tuple[Langevin, Family, Scale, Trajectory, Array]:
+        """Settings, problems, units, initial knots and keys of an attempt on some problems."""
+        solver, some = self.solver, self.family.some(indices)
+        key = jax.random.fold_in(jax.random.key(self.seed), self.attempt)
         keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(indices))
         knots = some.over(partial(_drawn, self.chains))(some.problem, keys)
         if solver.descent is None:
             flow, scale = solver.flow, solver.flow.scale
             cost, noise = (np.broadcast_to(s, len(indices)) for s in (scale.cost, scale.noise))
-        elif attempt == 0:
+        elif self.attempt == 0:
             flow = solver.first(1.0)
             costs = np.asarray(_worth(some, knots)[0])
             self.unit[indices] = [unit_of(row) for row in costs]
             cost, noise = self.unit[indices], np.zeros(len(indices))
         else:
-            flow, cost = solver.flow, self.unit[indices]
+            flow = replace(solver.flow, scale=solver.first(1.0).scale)  # of that type: no compiling
+            cost = self.unit[indices]
             feasible = self.defect[indices] < FEASIBLE
             rows = zip(self.cost[indices], feasible, cost, strict=True)
             noise = np.sqrt([level(*row) for row in rows])
         scales = Scale(jnp.asarray(cost, knots.x.dtype), jnp.asarray(noise, knots.x.dtype))
-        total, tail = int(flow.iterations + flow.tail), int(flow.tail) > 0
-        if not self.compile_time:
-            jax.block_until_ready(_flowed(flow, some, scales, knots, keys, 0, tail, self.mesh))
-            self.compile_time = time.perf_counter() - clock
-        found = _flowed(flow, some, scales, knots, keys, total, tail, self.mesh)
-        self._keep(indices[:count], *jax.tree.map(lambda a: np.asarray(a)[:count], found))
+        return flow, some, scales, knots, keys
 
     def _keep(self, indices: np.ndarray, knots: Trajectory, gains: np.ndarray, info: Info) -> None:
         """Every chain takes the best of what it has and of what was found for it.
@@ -346,7 +395,7 @@ class _Search:
             self.x[rows, to], self.u[rows, to] = knots.x[better, place], knots.u[better, place]
             self.gains[rows, to] = gains[better, place]
 
-    def solution(self, solve_time: float) -> BatchSolution:
+    def solution(self) -> BatchSolution:
         """The best chain of every problem, replayed."""
         clock = time.perf_counter()
         infeasible, value = ranking(self.cost, self.defect)
@@ -369,7 +418,7 @@ class _Search:
             open_loop=open_loop,
             feedback=feedback,
             compile_time=self.compile_time,
-            solve_time=solve_time,
+            solve_time=self.solve_time,
             replay_time=time.perf_counter() - clock,
         )
 

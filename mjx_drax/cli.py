@@ -142,6 +142,11 @@ def _parser() -> argparse.ArgumentParser:
     solving.add_argument("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
     solving.add_argument("--out", metavar="DIR", help="default out/TASK")
     solving.add_argument(
+        "--checkpoint",
+        metavar="FILE",
+        help="written every half minute; where it is there, the solve goes on from it",
+    )
+    solving.add_argument(
         "--no-video", action="store_true", help="leave out video.mp4 and timelapse.png"
     )
     solving.add_argument(
@@ -327,14 +332,17 @@ def _solve(options: argparse.Namespace) -> int:
     solver.check(problem)
     exports = _exports(options)
     _require_exports(problem, exports)
-    folder = results.writable(options.out or Path("out") / problem.name)
+    chains = options.chains or chains
+    room = results.expected_size(problem, chains)
+    folder = results.writable(options.out or Path("out") / problem.name, room)
     look = {n: getattr(options, n) for n in ("camera", "size", "fps", "speed")}
     look = {name: value for name, value in look.items() if value is not None}
     film = _film(options, folder, problem, draw, look)
     _cache_compilations()
     tell = _silent if options.quiet or options.json else say
 
-    chains = options.chains or chains
+    if options.checkpoint is not None and Path(options.checkpoint).expanduser().exists():
+        tell(f"going on from {options.checkpoint}")
     tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
     with _Bar() as bar:
         solution = solve(
@@ -344,6 +352,7 @@ def _solve(options: argparse.Namespace) -> int:
             solver,
             progress=None if options.quiet else bar,
             record=1 if film else None,
+            checkpoint=options.checkpoint,
         )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *_pictures(solution, folder, draw)]
@@ -419,12 +428,15 @@ def _film(
 ) -> Path | None:
     """Where the film goes, if one is asked for; what cannot be filmed is refused before solving."""
     from mjx_drax import movie, rendering
+    from mjx_drax.files import require_room
 
     if options.film is not None or look:
         rendering.check(problem, draw=draw, **look)
-    return (
-        movie.film_path(options.film or folder / "film.mp4") if options.film is not None else None
-    )
+    if options.film is None:
+        return None
+    film = movie.film_path(options.film or folder / "film.mp4")
+    require_room(film)
+    return film
 
 
 def _pictures(solution: Solution, folder: Path, draw: Any) -> list[str]:

@@ -7,7 +7,8 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from itertools import islice
 
 import jax
 import jax.numpy as jnp
@@ -164,6 +165,29 @@ class Recorder:
             for tries in self.attempts:
                 shots = tries.snapshots
                 tries.snapshots = [*shots[:-1:2], shots[-1]]
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All of it, as arrays."""
+        shots = [shot for tries in self.attempts for shot in tries.snapshots]
+        return {
+            "every": np.array(self.every),
+            "owners": np.array([tries.owners for tries in self.attempts]),
+            "counts": np.array([len(tries.snapshots) for tries in self.attempts]),
+            **{
+                f.name: np.array([getattr(shot, f.name) for shot in shots])
+                for f in fields(Snapshot)
+            },
+        }
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Become the recorder of which these are the arrays."""
+        rows = zip(*(saved[f.name] for f in fields(Snapshot)), strict=True)
+        shots = iter([Snapshot(int(i), float(sigma), *rest) for i, sigma, *rest in rows])
+        self.every = int(saved["every"])
+        self.attempts = [
+            Tries(owners, list(islice(shots, int(count))))
+            for owners, count in zip(saved["owners"], saved["counts"], strict=True)
+        ]
 
     def recording(self) -> Recording:
         """What was kept; an attempt that was interrupted before its first snapshot is left out."""

@@ -31,8 +31,10 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
+from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
+from mjx_drax.checkpoint import Checkpoint, digest, facts
 from mjx_drax.devices import SPLIT, mesh_for, spread
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import (
@@ -49,7 +51,7 @@ from mjx_drax.langevin import (
     ranking,
 )
 from mjx_drax.problem import Problem, Trajectory
-from mjx_drax.recording import Recorder, knot_defects
+from mjx_drax.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.schedules import Geometric
 
 CHUNK = 20
@@ -62,8 +64,8 @@ UNIT = 1 / 300
 MORE = 10.0
 """Factor on the unit of cost after an attempt in which not one chain became feasible."""
 
-MENDINGS, STEPS = 30, 2
-"""Rounds of replays after an attempt, and iterations of the tail in each, where f has kinks."""
+REPLAYS, MENDINGS, STEPS = 2, 30, 2
+"""Where f has kinks: replays after an attempt, rounds of more, iterations of the tail in each."""
 
 ENOUGH = 0.1
 """Largest share of chains to be done where f has kinks; attempts are long there."""
@@ -150,6 +152,7 @@ def with_iterations(solver: Langevin | Restarts, iterations: int) -> Langevin | 
     return replace(solver, flow=flow, descent=descent)
 
 
+@register_dataclass
 @dataclass(frozen=True)
 class Attempt:
     """Where chains stand after an attempt, and since which iteration each was feasible, or -1."""
@@ -167,6 +170,44 @@ class Attempt:
     def feasible(self) -> np.ndarray:
         """Whether max|h| < `FEASIBLE`, (chains,)."""
         return np.asarray(self.info.max_defect) < FEASIBLE
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Stand:
+    """Where a search stands: all that the rest of it depends on.
+
+    Attributes:
+        attempt: the one that is under way, from 0.
+        unit: of cost.
+        owners: for which chain each place in the batch works, (chains,).
+        kept: the best of the attempts before; None in the first.
+        at: where this attempt's chains are.
+        damping: of each chain while replays lead it on, (chains,).
+        records, began: as in `Run`.
+        step: how many of the attempt's iterations are done.
+        mended: how many replays, and rounds of them, have led its chains on since.
+    """
+
+    attempt: int
+    unit: float
+    owners: np.ndarray
+    kept: Attempt | None
+    at: Attempt
+    damping: np.ndarray
+    records: tuple[tuple[int, Info], ...]
+    began: tuple[tuple[int, int], ...] = ()
+    step: int = 0
+    mended: int = 0
+
+    @property
+    def done(self) -> int:
+        """Iterations of the whole search, at the last report."""
+        return self.records[-1][0]
+
+    def best(self) -> Attempt:
+        """The best of all attempts, this one included."""
+        return self.at if self.kept is None else _best(self.kept, self.at, self.owners)
 
 
 @dataclass(frozen=True)
@@ -193,11 +234,13 @@ def run(
     progress: Progress | None = None,
     recorder: Recorder | None = None,
     devices: int | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments."""
     solver = as_restarts(problem, chains, seed, solver)
     mesh = mesh_for(chains, devices)
-    return _Search(problem, chains, seed, guess, progress, recorder, mesh).run(solver)
+    search = _Search(problem, chains, seed, guess, progress, recorder, mesh, checkpoint)
+    return search.run(solver)
 
 
 def as_restarts(problem: Problem, chains: int, seed: int, solver: Langevin | Restarts) -> Restarts:
@@ -221,6 +264,9 @@ def as_restarts(problem: Problem, chains: int, seed: int, solver: Langevin | Res
 class _Search:
     """The attempts of one solve."""
 
+    stand: Stand
+    clock: float
+
     def __init__(
         self,
         problem: Problem,
@@ -230,54 +276,145 @@ class _Search:
         progress: Progress | None,
         recorder: Recorder | None,
         mesh: Mesh | None,
+        checkpoint: Checkpoint | None,
     ) -> None:
         self.problem, self.chains, self.seed, self.mesh = problem, chains, seed, mesh
         self.guess, self.progress, self.recorder = guess, progress, recorder
-        self.records: list[tuple[int, Info]] = []
-        self.began: list[tuple[int, int]] = []
-        self.done = 0
+        self.checkpoint = checkpoint
 
     def run(self, solver: Restarts) -> Run:
         clock = time.perf_counter()
-        flow, total = solver.flow, solver.iterations
-        kinked = self.problem.dynamics.kinked
-        enough = min(solver.enough, ENOUGH) if kinked else solver.enough
+        flow = solver.flow
         if solver.descent is not None:
             flow = replace(flow, scale=_scale(1.0, 1.0))  # not yet known, but of that type
+        if self.checkpoint is not None:
+            self._require(self.checkpoint, solver, flow)
         state, info = self._start(flow, 0)
         _require_finite(self.problem, info)
-        unit = unit_of(np.asarray(info.cost))
+        unit, everyone = unit_of(np.asarray(info.cost)), np.arange(self.chains)
+        at, damping = Attempt(state, info, np.full(self.chains, -1)), np.ones(self.chains)
+        self.stand = Stand(0, unit, everyone, None, at, damping, ((0, info),))
         first = solver.first(unit)
-        jax.block_until_ready(self._advanced(first, state, 0, 0, int(flow.tail) > 0))
-        if solver.attempts > 1:
-            _gather((state, info), (state, info), np.arange(self.chains))
-        if self.recorder is not None:
-            knot_defects(self.problem, state.trajectory)
+        before, answered = self._resumed(first)
+        if not answered:
+            jax.block_until_ready(self._advanced(first, state, 0, 0, int(flow.tail) > 0))
+            if solver.attempts > 1:
+                _gather((state, info), (state, info), everyone)
+            if self.recorder is not None:
+                knot_defects(self.problem, state.trajectory)
         compile_time = time.perf_counter() - clock
 
-        clock = time.perf_counter()
-        self.records.append((0, info))
-        kept, complete = self._attempt(first, state, info, np.arange(self.chains), total)
-        for attempt in range(1, solver.attempts):
-            done = finished(kept.cost, kept.feasible, solver.within, unit)
-            left = np.flatnonzero(~done)
-            if not complete or len(left) <= (1.0 - enough) * self.chains:
-                break
-            owners = np.resize(left, self.chains)
-            if not kept.feasible.any():
-                unit = MORE * unit  # the knots' cost says too little: penalize defects more
-            if kinked:
-                flow = solver.first(unit)
-            elif solver.descent is not None:
-                temperature = level(kept.cost, kept.feasible, unit)
-                flow = replace(flow, scale=_scale(unit, np.sqrt(temperature)))
-            try:
-                found, complete = self._attempt(flow, *self._start(flow, attempt), owners, total)
-                kept = _best(kept, found, owners)
-            except KeyboardInterrupt:  # between two attempts
-                break
-        times = compile_time, time.perf_counter() - clock
-        return Run(kept.state, kept.info, kept.converged_at, self.records, self.began, *times)
+        self.clock = time.perf_counter() - before
+        kept, ended = self.stand.kept, False
+        try:
+            while True:
+                flow = self._flow(solver, self.stand.unit, self.stand.kept)
+                complete = self._attempt(flow, solver.iterations)
+                kept = self.stand.best()
+                ended = complete and not self._next(solver, kept)
+                if ended or not complete:
+                    break
+        except KeyboardInterrupt:  # between two attempts
+            if kept is None:
+                raise
+        if not answered:
+            self._save(ended, now=True)
+        records, began = list(self.stand.records), list(self.stand.began)
+        times = compile_time, time.perf_counter() - self.clock
+        return Run(kept.state, kept.info, kept.converged_at, records, began, *times)
+
+    def _next(self, solver: Restarts, kept: Attempt) -> bool:
+        """Begin another attempt; False if none is to be made."""
+        stand, enough = self.stand, solver.enough
+        if self.problem.dynamics.kinked:
+            enough = min(enough, ENOUGH)
+        left = np.flatnonzero(~finished(kept.cost, kept.feasible, solver.within, stand.unit))
+        attempt, unit = stand.attempt + 1, stand.unit
+        if attempt == solver.attempts or len(left) <= (1.0 - enough) * self.chains:
+            return False
+        if not kept.feasible.any():
+            unit = MORE * unit  # the knots' cost says too little: penalize defects more
+        owners = np.resize(left, self.chains)
+        state, info = self._start(self._flow(solver, unit, kept), attempt)
+        at, damping = Attempt(state, info, np.full(self.chains, -1)), np.ones(self.chains)
+        history = stand.records, stand.began
+        self.stand = Stand(attempt, unit, owners, kept, at, damping, *history)
+        return True
+
+    def _flow(self, solver: Restarts, unit: float, kept: Attempt | None) -> Langevin:
+        """The settings of an attempt after those that led to `kept`."""
+        if kept is None or self.problem.dynamics.kinked:
+            return solver.first(unit)
+        if solver.descent is None:
+            return solver.flow
+        temperature = level(kept.cost, kept.feasible, unit)
+        return replace(solver.flow, scale=_scale(unit, np.sqrt(temperature)))
+
+    def _require(self, checkpoint: Checkpoint, solver: Restarts, flow: Langevin) -> None:
+        """Complain now about a checkpoint of another question, or one that cannot be written."""
+        problem, recorder = self.problem, self.recorder
+        known = facts(problem, self.chains, self.seed, solver, self.mesh)
+        record = None if recorder is None else recorder.every
+        checkpoint.require({"call": "solve", **known, "record": record})
+
+        def start() -> tuple[State, Info]:
+            shape, dtype = (self.chains, problem.horizon), problem.x_init.dtype
+            x, u = (
+                jnp.zeros((*shape, n), dtype) for n in (problem.dynamics.nx, problem.dynamics.nu)
+            )
+            return _init(flow, problem, Trajectory(x, u), jax.random.key(0))
+
+        def size(tree: Any) -> int:
+            return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+        state, info = jax.eval_shape(start)
+        reports = solver.attempts * (100 + MENDINGS)
+        recording = 0 if recorder is None else LIMIT
+        checkpoint.require_room(2 * size(state) + reports * size(info) + recording)
+
+    def _resumed(self, flow: Langevin) -> tuple[float, bool]:
+        """Stand where the checkpoint was written; how long solving took so far, and if it ended."""
+        checkpoint, stand = self.checkpoint, self.stand
+        if checkpoint is None:
+            return 0.0, False
+        state, tail = stand.at.state, int(flow.tail) > 0
+        checkpoint.require({"initial knots": digest(state.trajectory)})
+        program = _advance.lower(flow, self.problem, state, 0, 0, tail, self.mesh)
+        checkpoint.require({"functions": digest(program.as_text())})
+        if checkpoint.found is None:
+            return 0.0, False
+        later = int(checkpoint.found["stand.attempt"]) > 0
+        self.stand = replace(stand, kept=stand.at if later else None)
+        saved = checkpoint.restored(self._saved(0.0, False))
+        iterations, infos = saved["iterations"].tolist(), saved["infos"]
+        records = [
+            (n, jax.tree.map(lambda rows, i=i: rows[i], infos)) for i, n in enumerate(iterations)
+        ]
+        began = tuple((int(a), int(b)) for a, b in saved["began"])
+        self.stand = replace(saved["stand"], records=tuple(records), began=began)
+        if self.recorder is not None:
+            self.recorder.restore(saved["recorder"])
+        return saved["solve_time"], saved["ended"]
+
+    def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        stand, recorder = self.stand, self.recorder
+        iterations, infos = zip(*stand.records, strict=True)
+        return {
+            "stand": replace(stand, records=(), began=()),
+            "iterations": np.array(iterations),
+            "infos": jax.tree.map(lambda *rows: np.stack(rows), *infos),
+            "began": np.array(stand.began, int),
+            "recorder": None if recorder is None else recorder.saved(),
+            "solve_time": solve_time,
+            "ended": ended,
+        }
+
+    def _save(self, ended: bool = False, now: bool = False) -> None:
+        """Write a checkpoint, if one is asked for and it is time to."""
+        if self.checkpoint is not None:
+            solve_time = time.perf_counter() - self.clock
+            self.checkpoint.save(lambda: self._saved(solve_time, ended), now)
 
     def _start(self, flow: Langevin, attempt: int) -> tuple[State, Info]:
         """New initial knots and random numbers for every place in the batch."""
@@ -286,56 +423,66 @@ class _Search:
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
         return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
 
-    def _mended(self, flow: Langevin, kept: Attempt, expected: int) -> tuple[Attempt, bool]:
-        """The attempt, its chains led on along replays where f has kinks; and if uninterrupted.
+    def _mended(self, flow: Langevin, expected: int) -> bool:
+        """Lead the attempt's chains on along replays where f has kinks; False if interrupted.
 
         Where contacts switch, linear models of f are wrong, and steps that trust them leave
         defects. A replay has none. So each chain takes its replay, and then every two steps of the
         tail are replayed with their feedback: what is feasible and cheaper is kept, and chains for
         which it is not are damped more.
         """
-        if not self.problem.dynamics.kinked or kept.feasible.all() or flow.tail < STEPS:
-            return kept, True
-        everyone, total = np.arange(self.chains), flow.iterations + flow.tail
+        begun, kinked = self.stand.mended > 0, self.problem.dynamics.kinked
+        if not kinked or flow.tail < STEPS or (self.stand.at.feasible.all() and not begun):
+            return True
         try:
-            for with_feedback in (0.0, 1.0):
-                kept = _best(kept, self._replayed(flow, kept, with_feedback), everyone)
-            damping = np.ones(self.chains)
-            for _ in range(MENDINGS):
-                found = self._stepped(flow, kept, damping)
-                found = _best(found, self._replayed(flow, found, 1.0), everyone)
-                improved = _improved(kept, found)
-                kept = _best(kept, found, everyone)
-                damping = np.clip(damping * np.where(improved, EASE, TIGHTEN), *DAMPING)
-                self._report(flow, total, kept, expected)
-                if not improved.any() and (damping == DAMPING[1]).all():
-                    break
+            while self.stand.mended < REPLAYS + MENDINGS:
+                self._mend(flow, expected)
         except KeyboardInterrupt:
-            return kept, False
-        return kept, True
+            return False
+        return True
 
-    def _stepped(self, flow: Langevin, kept: Attempt, damping: np.ndarray) -> Attempt:
+    def _mend(self, flow: Langevin, expected: int) -> None:
+        """A replay without feedback, then one with it, then rounds of steps and replays."""
+        stand, everyone = self.stand, np.arange(self.chains)
+        kept, damping, mended = stand.at, stand.damping, stand.mended + 1
+        if stand.mended < REPLAYS:
+            replayed = self._replayed(flow, kept, float(stand.mended), stand.done)
+            self.stand = replace(stand, at=_best(kept, replayed, everyone), mended=mended)
+            return
+        done = stand.done + STEPS
+        found = self._stepped(flow, kept, damping, done)
+        found = _best(found, self._replayed(flow, found, 1.0, done), everyone)
+        improved = _improved(kept, found)
+        kept = _best(kept, found, everyone)
+        damping = np.clip(damping * np.where(improved, EASE, TIGHTEN), *DAMPING)
+        if not improved.any() and (damping == DAMPING[1]).all():
+            mended = REPLAYS + MENDINGS  # more would change nothing
+        self._report(flow, replace(stand, at=kept, damping=damping, mended=mended), done, expected)
+
+    def _stepped(self, flow: Langevin, kept: Attempt, damping: np.ndarray, done: int) -> Attempt:
         """The attempt after the last `STEPS` of the tail's iterations, once more."""
         total = flow.iterations + flow.tail
         state = replace(kept.state, damping=jnp.asarray(damping, kept.state.damping.dtype))
         state, info = self._advanced(flow, state, total - STEPS, total)
-        self.done += STEPS
-        return Attempt(state, info, np.full(self.chains, self.done))
+        return Attempt(state, info, np.full(self.chains, done))
 
-    def _report(self, flow: Langevin, step: int, at: Attempt, expected: int) -> None:
-        """Record where the chains are after `step` iterations of an attempt, and tell."""
-        self.records.append((self.done, at.info))
-        self._snap(flow, step, at.state, at.info)
+    def _report(self, flow: Langevin, stand: Stand, done: int, expected: int) -> None:
+        """Stand there, after `done` iterations of the search: record it, keep it and tell."""
+        at = stand.at
+        self.stand = replace(stand, records=(*stand.records, (done, at.info)))
+        self._snap(flow)
+        self._save()
         if self.progress is not None:
-            self.progress(self.done, max(expected, self.done), at.info)
+            self.progress(done, max(expected, done), at.info)
 
-    def _snap(self, flow: Langevin, step: int, state: State, info: Info) -> None:
+    def _snap(self, flow: Langevin) -> None:
         """Record knots too, if asked for."""
         if self.recorder is not None:
-            knots = state.trajectory
-            self.recorder.take(self.problem, flow, step, self.done, knots, info)
+            stand, at = self.stand, self.stand.at
+            knots = at.state.trajectory
+            self.recorder.take(self.problem, flow, stand.step, stand.done, knots, at.info)
 
-    def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float) -> Attempt:
+    def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float, done: int) -> Attempt:
         """Every chain's knots replaced by a replay of its controls."""
         problem, knots = self.problem, kept.state.trajectory
         gains, dtype = with_feedback * np.asarray(kept.state.gains), knots.x.dtype
@@ -343,39 +490,36 @@ class _Search:
         replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
         state = _moved_to(flow, problem, kept.state, replayed)
         state, info = self._advanced(flow, state, 0, 0)  # compiled already; just evaluates
-        return Attempt(state, info, np.full(self.chains, self.done))
+        return Attempt(state, info, np.full(self.chains, done))
 
-    def _attempt(
-        self, flow: Langevin, state: State, info: Info, owners: np.ndarray, expected: int
-    ) -> tuple[Attempt, bool]:
-        """One attempt on behalf of owners (chains,), and whether it was not interrupted."""
-        noisy = int(flow.iterations) if flow.sigma(0) > 0.0 else 0
-        self.began.append((self.done, self.done + noisy))
-        if self.recorder is not None:
-            self.recorder.begin(owners)
-        self._snap(flow, 0, state, info)
-        found, complete = self._flowed(flow, state, info, expected)
-        return self._mended(flow, found, expected) if complete else (found, False)
+    def _attempt(self, flow: Langevin, expected: int) -> bool:
+        """What is left of an attempt; False if it is interrupted."""
+        stand = self.stand
+        if len(stand.began) == stand.attempt:
+            noisy = int(flow.iterations) if flow.sigma(0) > 0.0 else 0
+            if self.recorder is not None:
+                self.recorder.begin(stand.owners)
+            self.stand = replace(stand, began=(*stand.began, (stand.done, stand.done + noisy)))
+            self._snap(flow)
+        return self._flowed(flow, expected) and self._mended(flow, expected)
 
-    def _flowed(
-        self, flow: Langevin, state: State, info: Info, expected: int
-    ) -> tuple[Attempt, bool]:
-        """All iterations of one attempt, and whether they were not interrupted."""
+    def _flowed(self, flow: Langevin, expected: int) -> bool:
+        """What is left of the iterations of an attempt; False if they are interrupted."""
         total, tail = flow.iterations + flow.tail, int(flow.tail) > 0
-        done, before, at = 0, self.done, Attempt(state, info, np.full(self.chains, -1))
+        before = self.stand.done - self.stand.step
         try:
-            while done < total:
-                stop = min(done + self._stride(total), total)
-                ahead = self._advanced(flow, at.state, done, stop, tail)
-                (state, info), done = jax.block_until_ready(ahead), stop
-                self.done = before + done
+            while self.stand.step < total:
+                stand, at = self.stand, self.stand.at
+                stop = min(stand.step + self._stride(total), total)
+                ahead = self._advanced(flow, at.state, stand.step, stop, tail)
+                state, info = jax.block_until_ready(ahead)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
-                since = np.where(at.converged_at < 0, self.done, at.converged_at)
+                since = np.where(at.converged_at < 0, before + stop, at.converged_at)
                 at = Attempt(state, info, np.where(feasible, since, -1))
-                self._report(flow, done, at, expected)
+                self._report(flow, replace(stand, at=at, step=stop), before + stop, expected)
         except KeyboardInterrupt:  # the chains as they were at the last report
-            return at, False
-        return at, True
+            return False
+        return True
 
     def _advanced(
         self, flow: Langevin, state: State, start: int, stop: int, tail: bool = True

@@ -10,22 +10,20 @@ import contextlib
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from mjx_drax import __version__
+from mjx_drax.checkpoint import versions
 from mjx_drax.errors import DraxError
-from mjx_drax.files import complete
+from mjx_drax.files import complete, require_room
 from mjx_drax.mjcf import MjxDynamics
 from mjx_drax.optima import Optimum
-from mjx_drax.problem import Trajectory
+from mjx_drax.problem import Problem, Trajectory
 from mjx_drax.settings import to_data
 from mjx_drax.solution import Solution
 from mjx_drax.source import binary
@@ -37,6 +35,9 @@ FORMAT = 1
 
 WHOLE = ("trajectories", "multipliers", "gains", "open_loop", "feedback")
 """Attributes of a solution that are written for all chains, by their names."""
+
+PICTURES = 5_000_000
+"""Bytes that pictures and videos may take."""
 
 OPTIMA = 32
 """So many of the distinct optima, cheapest first, go into result files."""
@@ -73,11 +74,7 @@ def summary(solution: Solution) -> dict[str, Any]:
         },
         "optima_found": len(solution.optima),
         "optima": [_answer(optimum) for optimum in solution.optima[:OPTIMA]],
-        "versions": {
-            "python": sys.version.split()[0],
-            "mjx-drax": __version__,
-            **{name: version(name) for name in ("jax", "mujoco", "mujoco-mjx", "numpy")},
-        },
+        "versions": versions(),
         "device": jax.devices()[0].device_kind,
     }
 
@@ -193,24 +190,28 @@ def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def writable(folder: str | os.PathLike[str]) -> Path:
-    """The folder, made if need be; call it before a long computation.
+def writable(folder: str | os.PathLike[str], size: int = 1) -> Path:
+    """The folder, made if need be, with room for `size` bytes; call it before a long computation.
 
     Raises:
-        DraxError: it cannot be made or written to.
+        DraxError: it cannot be made or written to, or the disk is too full.
     """
     path = Path(folder).expanduser()
-    probe = path / ".writable"
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise DraxError(
-            f"cannot write to the folder {str(path)!r}: {error.strerror or error}. "
-            "Choose another with --out, or make it writable."
-        ) from error
+        require_room(path / ARRAYS, size)
+    except DraxError as error:
+        raise DraxError(f"{error} In the shell: --out DIR.") from error
     return path
+
+
+def expected_size(problem: Problem, chains: int) -> int:
+    """Bytes that the result files of a solve and its pictures may take, a rough estimate."""
+    dynamics, constraint = problem.dynamics, problem.constraint
+    knot, rows = dynamics.nx + dynamics.nu, constraint.equalities + constraint.inequalities
+    plan = 3 * knot + 2 * rows + dynamics.ndx * (1 + dynamics.nu)  # with multipliers and gains
+    replays = 2 * knot * np.dtype(float).itemsize
+    each = plan * problem.x_init.dtype.itemsize + replays
+    return PICTURES + chains * problem.horizon * each
 
 
 def _number(value: Any) -> float | None:

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_drax.checkpoint import Checkpoint
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Langevin, feedback_gains, worth
 from mjx_drax.precondition import GaussNewton, Multipliers
@@ -282,6 +283,7 @@ def solve(
     progress: Progress | None = None,
     record: int | None = None,
     devices: int | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
 
@@ -300,19 +302,24 @@ def solve(
             and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
         devices: how many to spread the chains over; by default as many of this host's as divide
             their number.
+        checkpoint: a file to write every half minute, and to go on from where it is there, after
+            the same call was killed or ended by Ctrl-C. The answer is the same, bit for bit. A
+            file that belongs to a complete solve gives its answer again; it may be deleted.
 
     Returns:
         the solution with its certificate; look at `solution.certified`.
 
     Raises:
-        DraxError: sizes that misfit, or a cost or dynamics that are not finite at any initial knot.
+        DraxError: sizes that misfit; a cost or dynamics that are not finite at any initial knot; a
+            checkpoint that cannot be written, is damaged or belongs to another solve.
     """
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     solver = solver or Restarts()
     recorder = None if record is None else Recorder(record)
-    found = run(problem, chains, seed, solver, guess, progress, recorder, devices)
+    file = None if checkpoint is None else Checkpoint(checkpoint)
+    found = run(problem, chains, seed, solver, guess, progress, recorder, devices, file)
     solution = _certified(problem, solver, seed, found)
     return solution if recorder is None else replace(solution, recording=recorder.recording())
 

@@ -101,9 +101,9 @@ def test_finished_problems_leave_the_batch(monkeypatch):
     sizes = []
     chunk = batch._Search._chunk
 
-    def counted(self, indices, count, attempt):
-        sizes.append((attempt, count))
-        chunk(self, indices, count, attempt)
+    def counted(self, indices, count):
+        sizes.append((self.attempt, count))
+        chunk(self, indices, count)
 
     monkeypatch.setattr(batch._Search, "_chunk", counted)
     # In one iteration no chain becomes feasible

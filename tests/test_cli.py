@@ -1,5 +1,6 @@
 """The command line, in this process; the heavy commands with the smallest sizes that still work."""
 
+import errno
 import importlib.util
 import json
 import os
@@ -191,6 +192,39 @@ def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, mon
     assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--keyframes")
     without("h5py")
     assert "mjx-drax[dataset]" in error_of(capsys, "solve", "bug_trap", "--dataset")
+
+
+def test_places_that_cannot_be_written_are_refused_before_the_solve(own, capsys, monkeypatch):
+    monkeypatch.setattr("mjx_drax.restarts._Search.run", lambda *_: pytest.fail("it was solved"))
+    (own / "file").touch()
+    short, inside = (
+        ["solve", "pendulum_swingup", "--out", str(own / "out")],
+        str(own / "file" / "x"),
+    )
+    assert "cannot read" in error_of(capsys, *short, "--checkpoint", inside)
+    assert "cannot write" in error_of(capsys, *short, "--film", f"{inside}.gif")
+    sizes = []
+    monkeypatch.setattr(os, "posix_fallocate", lambda *where: sizes.append(where[-1]) or full())
+    assert "No space left on device" in error_of(capsys, *short)
+    assert 5e6 < sizes[0] < 1e8
+
+
+def full():
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_checkpoint_is_gone_on_from(tmp_path, capsys, monkeypatch):
+    file = tmp_path / "run.ckpt"
+    short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video"
+    arguments = [*short.split(), "--out", str(tmp_path), "--checkpoint", str(file)]
+    main(arguments)
+    assert "going on" not in capsys.readouterr().out
+    first = Solution.load(tmp_path)
+    monkeypatch.setattr("mjx_drax.restarts._Search._advanced", None)
+    main(arguments)
+    assert f"going on from {file}\n" in capsys.readouterr().out
+    np.testing.assert_array_equal(Solution.load(tmp_path).trajectories.u, first.trajectories.u)
+    assert "seed 0, and this solve has seed 1" in error_of(capsys, *arguments, "--seed", "1")
 
 
 def test_a_dataset_without_certified_chains_is_left_out(slider, tmp_path, capsys):

@@ -11,8 +11,9 @@ from mjx_drax.devices import mesh_for
 
 PROGRAM = """
 from dataclasses import replace
+import sys
 import jax, jax.numpy as jnp, numpy as np
-from mjx_drax import Restarts, from_function, solve, solve_batch
+from mjx_drax import Restarts, checkpoint, from_function, solve, solve_batch
 
 assert len(jax.devices()) == 8
 problem = from_function(
@@ -25,6 +26,27 @@ solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, 
 alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, None))
 np.testing.assert_allclose(spread.trajectories.u, alone.trajectories.u, atol=1e-4)
 np.testing.assert_allclose(spread.cost, alone.cost, rtol=1e-4)
+
+class Killed(BaseException):
+    pass
+
+def kill(*_):
+    raise Killed
+
+checkpoint.EVERY = 0.0
+try:
+    solve(problem, 8, 0, solver, progress=kill, checkpoint=sys.argv[1])
+except Killed:
+    pass
+resumed = solve(problem, 8, 0, solver, checkpoint=sys.argv[1])
+two = solve(problem, 8, 0, solver, devices=2)
+for other in (resumed, two):
+    np.testing.assert_array_equal(other.trajectories.u, spread.trajectories.u)
+    np.testing.assert_array_equal(other.cost, spread.cost)
+try:
+    solve(problem, 8, 0, solver, devices=2, checkpoint=sys.argv[1])
+except ValueError as error:
+    assert "devices 8, and this solve has devices 2" in str(error)
 starts = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2)).astype(np.float32)
 one, many = (
     solve_batch(lambda x: replace(problem, x_init=x), starts, 2, 0, solver, devices=n)
@@ -35,11 +57,11 @@ print("same", spread.solve_time)
 """
 
 
-def test_eight_devices_give_the_answers_of_one():
+def test_eight_devices_give_the_answers_of_one_and_of_two(tmp_path):
     flags = "--xla_force_host_platform_device_count=8"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     ran = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
+        [sys.executable, "-c", PROGRAM, str(tmp_path / "run.ckpt")],
         env=environment,
         capture_output=True,
         text=True,
