@@ -24,7 +24,7 @@ from jax.sharding import PartitionSpec as P
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
-from mjx_drax.devices import SPLIT, mesh_for, spread
+from mjx_drax.devices import SPLIT, divided, mesh_for, spread
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking, worth
 from mjx_drax.problem import Problem, Trajectory, checked
@@ -236,7 +236,7 @@ def solve_batch(
     solver = as_restarts(first, chains, seed, solver or Restarts())
     file = None if checkpoint is None else Checkpoint(checkpoint)
     size = chunk or (file and file.answered("chunk")) or fitting(first, chains)
-    size = min(size, family.count)
+    size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()
     search = _Search(family, chains, seed, solver, size, mesh_for(size, devices))
     search.run(progress, file)
     return search.solution()
@@ -244,7 +244,7 @@ def solve_batch(
 
 def fitting(problem: Problem, chains: int) -> int:
     """How many problems may be solved at a time, for the memory that is free now."""
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
         free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
@@ -340,12 +340,21 @@ class _Search:
     def _chunk(self, indices: np.ndarray, count: int) -> None:
         """One attempt on some problems; those after the first `count` fill up the chunk."""
         clock = time.perf_counter()
-        flow, *arguments = self._begun(indices)
+        flow, some, *rows = self._begun(indices)
         total, tail = int(flow.iterations + flow.tail), int(flow.tail) > 0
+
+        def flowed(iterations: int) -> tuple[Trajectory, Array, Info]:
+            def each(rows: Any) -> tuple[Trajectory, Array, Info]:
+                where, *rest = rows
+                return _flowed(flow, some.some(where), *rest, iterations, tail, self.mesh)
+
+            found: tuple[Trajectory, Array, Info] = divided(each, (np.arange(self.size), *rows))
+            return found
+
         if not self.compile_time:
-            jax.block_until_ready(_flowed(flow, *arguments, 0, tail, self.mesh))
+            jax.block_until_ready(flowed(0))
             self.compile_time = time.perf_counter() - clock
-        found = _flowed(flow, *arguments, total, tail, self.mesh)
+        found = flowed(total)
         self._keep(indices[:count], *jax.tree.map(lambda a: np.asarray(a)[:count], found))
 
     def _begun(self, indices: np.ndarray) -> tuple[Langevin, Family, Scale, Trajectory, Array]:

@@ -66,10 +66,16 @@ class Checkpoint:
         found: the arrays in the file, by name; None if there was no file.
 
     Raises:
-        DraxError: the file cannot be read, is damaged or is something else.
+        DraxError: the file cannot be read, is damaged or is something else; there are several
+            processes.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
+        if jax.process_count() > 1:
+            raise DraxError(
+                f"checkpoint is {str(path)!r}, and {jax.process_count()} processes cannot go on "
+                "from one file: leave it out, or solve in one process."
+            )
         self.path = Path(path).expanduser()
         self.question: dict[str, Any] = {"format": FORMAT}
         self.found, self._asked = _read(self.path)

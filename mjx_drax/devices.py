@@ -12,7 +12,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
@@ -22,16 +24,24 @@ SPLIT = P("share")
 
 
 def mesh_for(count: int, devices: int | None) -> Mesh | None:
-    """The devices that `count` chains are spread over, or None where one is enough.
+    """The devices that a process spreads its share of `count` chains over, or None for one.
 
     Args:
-        count: chains, or problems.
-        devices: how many to use; None: as many as there are that divide the count.
+        count: chains, or problems, of all processes.
+        devices: how many to use, of each process; None: as many as there are that divide its share.
 
     Raises:
-        DraxError: more devices than there are, or a number that does not divide the count.
+        DraxError: more devices than there are, or a number that does not divide the share; or
+            chains that cannot be shared among the processes.
     """
-    present = jax.local_devices()
+    present, processes = jax.local_devices(), jax.process_count()
+    if count % processes:
+        raise DraxError(
+            f"{count} cannot be spread evenly over {processes} processes: give a multiple."
+        )
+    if processes > 1:  # meet: the first time they wait for each other for half a minute only
+        multihost_utils.process_allgather(np.zeros(1))
+    count //= processes
     if devices is None:
         devices = max(n for n in range(1, len(present) + 1) if count % n == 0)
     if not isinstance(devices, int | np.integer) or not 1 <= devices <= len(present):
@@ -53,3 +63,29 @@ def spread(function: Callable[..., Any], mesh: Mesh | None, *specs: Any) -> Call
     if mesh is None:
         return function
     return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=SPLIT, check_vma=False)
+
+
+def divided(work: Callable[[Any], Any], rows: Any) -> Any:
+    """work(rows), each process working on its share of them and getting the results of all.
+
+    Args:
+        work: gives a tree whose leaves have a row for each that it was given, in their order.
+        rows: a tree of arrays with as many rows each, which the processes can share evenly.
+    """
+    processes, index = jax.process_count(), jax.process_index()
+    if processes == 1:
+        return work(rows)
+
+    def mine(leaf: jax.Array) -> jax.Array:
+        count = len(leaf) // processes
+        return leaf[index * count : (index + 1) * count]
+
+    return jax.tree.map(_exchanged, work(jax.tree.map(mine, rows)))
+
+
+def _exchanged(rows: jax.Array) -> jax.Array:
+    """The rows of all processes, one after the other, on a device of this one."""
+    if jnp.issubdtype(rows.dtype, jax.dtypes.prng_key):
+        data = _exchanged(jax.random.key_data(rows))
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(rows))
+    return jnp.asarray(multihost_utils.process_allgather(rows, tiled=True))

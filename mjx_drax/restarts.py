@@ -35,7 +35,7 @@ from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
-from mjx_drax.devices import SPLIT, mesh_for, spread
+from mjx_drax.devices import SPLIT, divided, mesh_for, spread
 from mjx_drax.errors import DraxError
 from mjx_drax.langevin import (
     DAMPING,
@@ -524,8 +524,13 @@ class _Search:
     def _advanced(
         self, flow: Langevin, state: State, start: int, stop: int, tail: bool = True
     ) -> tuple[State, Info]:
-        """Iterations start..stop-1 on all devices."""
-        return _advance(flow, self.problem, state, start, stop, tail, self.mesh)
+        """Iterations start..stop-1 on all devices of all processes."""
+
+        def advanced(state: State) -> tuple[State, Info]:
+            return _advance(flow, self.problem, state, start, stop, tail, self.mesh)
+
+        found: tuple[State, Info] = divided(advanced, state)
+        return found
 
     def _stride(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""

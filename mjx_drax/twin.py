@@ -45,7 +45,7 @@ def twin(
         mended.opt.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
     _mend(mended)
     try:
-        on_device = mjx.put_model(mended, impl="jax")
+        on_device = mjx.put_model(mended, device=jax.local_devices()[0], impl="jax")
         jax.eval_shape(mjx.make_data, on_device)
     except (NotImplementedError, ValueError) as error:
         raise DraxError(_refusal(mended, str(error))) from error

@@ -1,9 +1,11 @@
 """Chains spread over devices: the same answers. Virtual CPU devices, in a process of their own."""
 
 import os
+import socket
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from mjx_drax import DraxError
@@ -68,6 +70,61 @@ def test_eight_devices_give_the_answers_of_one_and_of_two(tmp_path):
         check=False,
     )
     assert ran.stdout.startswith("same"), ran.stderr
+
+
+PROCESS = """
+import sys
+import jax
+port, index, out = sys.argv[1:]
+if port != "alone":
+    jax.distributed.initialize(f"127.0.0.1:{port}", 2, int(index))
+from dataclasses import replace
+import jax.numpy as jnp, numpy as np
+from mjx_drax import DraxError, Restarts, from_function, from_mjcf, solve, solve_batch
+from mjx_drax.models import path
+
+from_mjcf(path("pendulum"), horizon=0.2, running_residual=lambda data, u: u)  # on own devices
+problem = from_function(
+    lambda x, u: x + 0.1 * jnp.array([x[1], u[0] - jnp.sin(x[0])]),
+    x_init=[0.5, 0.0], nu=1, dt=0.1, horizon=1.0,
+    running_residual=lambda x, u: 0.1 * u, terminal_residual=lambda x: 10.0 * x,
+    u_bounds=(-2.0, 2.0),
+)
+solver = Restarts(replace(Restarts().flow, iterations=8, tail=4), descent=4, attempts=2)
+found = solve(problem, 4, 0, solver)
+starts = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
+many = solve_batch(lambda x: replace(problem, x_init=x), starts, 2, 0, solver)
+if port != "alone":
+    for count, options, words in ((3, {}, "2 processes"), (4, {"checkpoint": "x"}, "one file")):
+        try:
+            solve(problem, count, 0, solver, **options)
+        except DraxError as error:
+            assert words in str(error), error
+np.savez(out, u=found.trajectories.u, x=found.trajectories.x, cost=found.cost,
+         ends=found.feedback.states, many=many.u, costs=many.cost)
+"""
+
+
+def test_two_processes_give_the_answers_of_one(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+
+    def start(port, index):
+        command = [sys.executable, "-c", PROCESS, port, index, str(tmp_path / f"{port}{index}.npz")]
+        return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+    running = [start("alone", "0"), start(port, "0"), start(port, "1")]
+    for process in running:
+        _, words = process.communicate(timeout=250)
+        assert process.returncode == 0, words
+    alone, first, second = (
+        np.load(tmp_path / f"{name}.npz") for name in ("alone0", f"{port}0", f"{port}1")
+    )
+    for name in alone:
+        np.testing.assert_array_equal(first[name], second[name])
+        np.testing.assert_allclose(first[name], alone[name], atol=1e-3)
 
 
 @pytest.mark.parametrize("devices", [0, 1000, "two"])
