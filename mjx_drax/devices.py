@@ -1,9 +1,10 @@
 """Chains, or problems, spread over the devices of this host; each works on its own share.
 
 Chains exchange nothing and each has its own random key, so answers do not depend on the shares: two
-devices and eight were seen to give the same, bit for bit. One device and several agree but for
-rounding, because XLA rewrites a program of several devices in other places (divisions become
-products, say).
+devices and four were seen to give the same, bit for bit. One device and several agree but for
+rounding: where numbers are divided by one of them, XLA multiplies by its reciprocal in a program of
+one device and divides in one of several. A single chain on a device rounds differently too, as its
+products are of matrices and no longer of batches of them.
 """
 
 from __future__ import annotations

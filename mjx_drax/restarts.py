@@ -357,19 +357,23 @@ class _Search:
         record = None if recorder is None else recorder.every
         checkpoint.require({"call": "solve", **known, "record": record})
 
+        shape, dtype = (self.chains, problem.horizon), problem.x_init.dtype
+        nx, nu = problem.dynamics.nx, problem.dynamics.nu
+
         def start() -> tuple[State, Info]:
-            shape, dtype = (self.chains, problem.horizon), problem.x_init.dtype
-            x, u = (
-                jnp.zeros((*shape, n), dtype) for n in (problem.dynamics.nx, problem.dynamics.nu)
-            )
+            x, u = (jnp.zeros((*shape, n), dtype) for n in (nx, nu))
             return _init(flow, problem, Trajectory(x, u), jax.random.key(0))
 
         def size(tree: Any) -> int:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
         state, info = jax.eval_shape(start)
-        reports = solver.attempts * (100 + MENDINGS)
-        recording = 0 if recorder is None else LIMIT
+        reports, recording = solver.attempts * (100 + MENDINGS), 0
+        if recorder is not None:
+            reports += solver.iterations // recorder.every
+            recording = min(
+                LIMIT, reports * self.chains * (nx + 2) * problem.horizon * dtype.itemsize
+            )
         checkpoint.require_room(2 * size(state) + reports * size(info) + recording)
 
     def _resumed(self, flow: Langevin) -> tuple[float, bool]:

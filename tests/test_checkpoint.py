@@ -20,6 +20,7 @@ from mjx_drax import (
     Trajectory,
     checkpoint,
     from_function,
+    from_mjcf,
     restarts,
     solve,
     solve_batch,
@@ -241,6 +242,36 @@ def test_ctrl_c_keeps_the_best_and_the_same_call_goes_on(whole, tmp_path):
     assert seen[0] > early.iterations
 
 
+BALL = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 0.5">
+      <joint name="lift" type="slide" axis="0 0 1"/>
+      <geom type="sphere" size="0.1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="lift" ctrlrange="-3 3"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("often")
+def test_a_model_with_contacts_goes_on_to_the_same_answer(tmp_path):
+    model = from_mjcf(BALL, horizon=0.6, dt=0.02, terminal_residual=lambda data: 10.0 * data.qpos)
+    given = {"problem": model, "solver": replace(SOLVER, attempts=2)}
+    seen, file = [], tmp_path / "run.ckpt"
+    whole = solved(progress=lambda *_: seen.append(1), **given)
+    assert len(seen) > 4
+    for count in range(1, len(seen) + 1):
+        with pytest.raises(Killed):
+            solved(checkpoint=file, progress=killed_after(count), **given)
+        assert_same(solved(checkpoint=file, **given), whole)
+        file.unlink()
+
+
 # The question
 
 
@@ -387,7 +418,8 @@ np.savez(sys.argv[2] + "/answer.npz", one.trajectories.u, one.cost, many.u, many
 """
 
 
-def test_killed_by_the_system_at_random_moments(whole, whole_batch, tmp_path):
+@pytest.mark.parametrize("kills", [3, pytest.param(8, marks=pytest.mark.slow)])
+def test_killed_by_the_system_at_random_moments(kills, whole, whole_batch, tmp_path):
     here, answer = os.path.dirname(__file__), tmp_path / "answer.npz"
     command = [sys.executable, "-c", PROGRAM, here, str(tmp_path)]
     random = np.random.default_rng()
@@ -395,7 +427,7 @@ def test_killed_by_the_system_at_random_moments(whole, whole_batch, tmp_path):
     def written():
         return [f.stat().st_mtime_ns for f in sorted(tmp_path.glob("*.ckpt"))]
 
-    for _ in range(4):
+    for _ in range(kills):
         before, process = written(), subprocess.Popen(command)
         while written() == before and process.poll() is None:
             time.sleep(0.01)

@@ -41,25 +41,25 @@ try:
 except Killed:
     pass
 resumed = solve(problem, 8, 0, solver, checkpoint=sys.argv[1])
-two = solve(problem, 8, 0, solver, devices=2)
-for other in (resumed, two):
-    np.testing.assert_array_equal(other.trajectories.u, spread.trajectories.u)
-    np.testing.assert_array_equal(other.cost, spread.cost)
+two, four = (solve(problem, 8, 0, solver, devices=n) for n in (2, 4))
+for one, other in ((resumed, spread), (two, four)):
+    np.testing.assert_array_equal(one.trajectories.u, other.trajectories.u)
+    np.testing.assert_array_equal(one.cost, other.cost)
 try:
     solve(problem, 8, 0, solver, devices=2, checkpoint=sys.argv[1])
 except ValueError as error:
     assert "devices 8, and this solve has devices 2" in str(error)
 starts = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2)).astype(np.float32)
-one, many = (
+alone, many = (
     solve_batch(lambda x: replace(problem, x_init=x), starts, 2, 0, solver, devices=n)
     for n in (1, 8)
 )
-np.testing.assert_allclose(many.u, one.u, atol=1e-4)
+np.testing.assert_allclose(many.u, alone.u, atol=1e-4)
 print("same", spread.solve_time)
 """
 
 
-def test_eight_devices_give_the_answers_of_one_and_of_two(tmp_path):
+def test_several_devices_give_the_answers_of_one(tmp_path):
     flags = "--xla_force_host_platform_device_count=8"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     ran = subprocess.run(
