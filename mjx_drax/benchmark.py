@@ -1,11 +1,12 @@
 """The benchmark: suites of methods and problems, a table, `benchmark.json` and a figure.
 
-    cpu     every task with its own settings and number of chains; then one pendulum on one CPU
-            thread, 1 to 16 chains against IPOPT in the same process
-    gpu     as many chains as suit a GPU, and ablations with the first seed; then 16,384 pendulums
-            with initial states of their own
-    peers   this solver, its ablations, IPOPT and shooting methods; an equal number of evaluations
-            of f for shooting as for this solver
+    cpu      every task with its own settings and number of chains; then one pendulum on one CPU
+             thread, 1 to 16 chains against IPOPT in the same process
+    gpu      as many chains as suit a GPU, and ablations with the first seed; then 16,384 pendulums
+             with initial states of their own
+    devices  the same solve on 1, 2, 4, ... devices of this machine, with chains enough for all
+    peers    this solver, its ablations, IPOPT and shooting methods; an equal number of evaluations
+             of f for shooting as for this solver
 
 `measure` says how each number comes about. IPOPT needs casadi (`pip install "mjx-drax[peers]"`);
 without it the suites `cpu` and `gpu` leave IPOPT out, and `peers` refuses to start.
@@ -53,6 +54,9 @@ GPU_CHAINS = {
 
 GPU_PROBES = 1
 """Interrupted solves for one row of the suite `gpu`: its replays take longer than its solves."""
+
+DEVICE_CHAINS = {"pendulum": 262_144, "acrobot_swingup": 8_192}
+"""Tasks of the suite `devices`, and their chains: so many that each device has much to do."""
 
 PEER_TASKS = ("pendulum", "bug_trap", "deep_trap", "cartpole_swingup", "acrobot_swingup")
 """Tasks of the suite `peers`; IPOPT and the ablations on those that are functions."""
@@ -144,6 +148,18 @@ def _gpu(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iter
         yield from _random_pendulums(chains or GPU_CHAINS["pendulum"], seeds)
 
 
+def _devices(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iterator[Row]:
+    for name in names:
+        problem, solver, _ = _task(name)
+        number = chains or DEVICE_CHAINS[name]
+        count = 1
+        while count <= jax.local_device_count():
+            label = f"{OURS}, {count} device{'s' if count > 1 else ''}"
+            for seed in seeds:
+                yield ours(problem, solver, number, seed, label, probes=0, devices=count)
+            count *= 2
+
+
 def _peers(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iterator[Row]:
     for name in names:
         problem, solver, number = _task(name)
@@ -176,6 +192,7 @@ def _peers(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> It
 SUITES: dict[str, tuple[Callable[..., Iterator[Row]], Callable[[], Sequence[str]]]] = {
     "cpu": (_cpu, tasks.names),
     "gpu": (_gpu, lambda: tuple(GPU_CHAINS)),
+    "devices": (_devices, lambda: tuple(DEVICE_CHAINS)),
     "peers": (_peers, lambda: PEER_TASKS),
 }
 """What measures a suite, and the tasks that it has."""

@@ -78,7 +78,7 @@ MOTIONS = ("video.mp4", "timelapse.png", "film.mp4")
 OPTIMA = 5
 """So many distinct optima are printed."""
 
-SUITES = ("cpu", "gpu", "peers")
+SUITES = ("cpu", "gpu", "devices", "peers")
 REPRODUCIBLE = ("phase-portrait", "convergence", "bug-trap", "parallel-table", "open-questions")
 
 
@@ -201,7 +201,8 @@ def _parser() -> argparse.ArgumentParser:
         help="measure success and time, alone or beside other methods",
         description="Solve tasks for several seeds; print a table; write benchmark.json (a list of "
         "rows) and benchmark.png (success against time). cpu: every task, and one pendulum on one "
-        "thread beside IPOPT. gpu: more chains, and 16,384 random pendulums. peers: ablations, "
+        "thread beside IPOPT. gpu: more chains, and 16,384 random pendulums. devices: one solve on "
+        "1, 2, 4, ... devices. peers: ablations, "
         'IPOPT, MPPI, CEM and model-based diffusion; IPOPT needs pip install "mjx-drax[peers]".',
     )
     measuring.add_argument("tasks", nargs="*", metavar="TASK", help="default: all of them")

@@ -161,9 +161,10 @@ def ours(
     seed: int,
     name: str = OURS,
     probes: int = PROBES,
+    devices: int | None = None,
 ) -> Row:
     """A solve, and when its first answer was there; with probes=0, only when its last one was."""
-    solution = solve(problem, chains, seed, solver)
+    solution = solve(problem, chains, seed, solver, devices=devices)
     replay = _seconds_of_a_replay(solution)
     answers = [*_interrupted(solution, probes), _judged(solution)]
     seconds, share, close = map(list, zip(*answers, strict=True))
