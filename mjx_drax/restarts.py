@@ -33,8 +33,10 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jax.typing import ArrayLike
 
+from mjx_drax.derivatives import Autodiff
 from mjx_drax.devices import SPLIT, mesh_for, spread
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_not_negative, require_whole, shown
+from mjx_drax.functions import require_functions
 from mjx_drax.langevin import (
     DAMPING,
     EASE,
@@ -48,7 +50,7 @@ from mjx_drax.langevin import (
     evaluate,
     ranking,
 )
-from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.problem import Problem, Trajectory, functions_of, numbers
 from mjx_drax.recording import Recorder, knot_defects
 from mjx_drax.schedules import Geometric
 
@@ -128,16 +130,13 @@ class Restarts:
             DraxError: naming the setting, its value and the fix.
         """
         if not isinstance(self.flow, Langevin):
-            raise DraxError(f"flow is {self.flow!r}: give a Langevin.")
+            raise DraxError(f"flow is {shown(self.flow)}: give a Langevin.")
         self.flow.check(problem)
-        descent = 0 if self.descent is None else self.descent
-        for name, count, least in (("descent", descent, 0), ("attempts", self.attempts, 1)):
-            if not isinstance(count, int | np.integer) or count < least:
-                raise DraxError(f"{name} is {count!r}: give a whole number of at least {least}.")
+        if self.descent is not None:
+            require_whole("descent", self.descent, 0)
+        require_whole("attempts", self.attempts)
         for name in ("within", "enough"):
-            value = getattr(self, name)
-            if not (isinstance(value, float | int | np.number) and value >= 0):
-                raise DraxError(f"{name} is {value!r}: give a number of at least 0.")
+            require_not_negative(name, getattr(self, name))
 
 
 def with_iterations(solver: Langevin | Restarts, iterations: int) -> Langevin | Restarts:
@@ -195,6 +194,7 @@ def run(
     devices: int | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments."""
+    require_functions(progress=progress)
     solver = as_restarts(problem, chains, seed, solver)
     mesh = mesh_for(chains, devices)
     return _Search(problem, chains, seed, guess, progress, recorder, mesh).run(solver)
@@ -206,12 +206,12 @@ def as_restarts(problem: Problem, chains: int, seed: int, solver: Langevin | Res
     Raises:
         DraxError: a number of chains, seed or setting that cannot work.
     """
-    if not isinstance(chains, int | np.integer) or chains < 1:
-        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
-    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+    require_whole("chains", chains)
+    require_whole("seed", seed, 0)
+    if seed >= 2**32:
         raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
     if not isinstance(solver, Langevin | Restarts):
-        raise DraxError(f"solver is {solver!r}: give a Langevin or a Restarts.")
+        raise DraxError(f"solver is {shown(solver)}: give a Langevin or a Restarts.")
     solver.check(problem)
     if isinstance(solver, Langevin):
         return Restarts(solver, descent=None, attempts=1)
@@ -245,7 +245,7 @@ class _Search:
         if solver.descent is not None:
             flow = replace(flow, scale=_scale(1.0, 1.0))  # not yet known, but of that type
         state, info = self._start(flow, 0)
-        _require_finite(self.problem, info)
+        _require_finite(flow, self.problem, state, info)
         unit = unit_of(np.asarray(info.cost))
         first = solver.first(unit)
         jax.block_until_ready(self._advanced(first, state, 0, 0, int(flow.tail) > 0))
@@ -284,6 +284,8 @@ class _Search:
         key = jax.random.key(self.seed)
         key_knots, key_noise = jax.random.split(jax.random.fold_in(key, attempt))
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
+        if attempt == 0 and not hasattr(self.problem.dynamics, "mj_model"):
+            _require_sound(flow, self.problem, knots)  # takes long for models: when they fail
         return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
 
     def _mended(self, flow: Langevin, kept: Attempt, expected: int) -> tuple[Attempt, bool]:
@@ -369,6 +371,8 @@ class _Search:
                 ahead = self._advanced(flow, at.state, done, stop, tail)
                 (state, info), done = jax.block_until_ready(ahead), stop
                 self.done = before + done
+                if before == 0 and (np.asarray(state.died_at) == 0).all():
+                    _require_sound(flow, self.problem, at.state.trajectory)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(at.converged_at < 0, self.done, at.converged_at)
                 at = Attempt(state, info, np.where(feasible, since, -1))
@@ -500,9 +504,16 @@ def initial_knots(
             return jax.vmap(problem.draw)(keys)
         return _draw(problem, keys)
     K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
+    if not isinstance(guess, Trajectory):
+        raise DraxError(f"guess is {shown(guess)}: give a Trajectory(x, u), or see guesses.")
     knots = []
     for label, value, size in (("x", guess.x, nx), ("u", guess.u, nu)):
-        array = np.asarray(value, problem.x_init.dtype)
+        try:
+            array = np.asarray(numbers(value), problem.x_init.dtype)
+        except (TypeError, ValueError) as error:
+            raise DraxError(
+                f"guess.{label} is {shown(value)}: give numbers of shape ({K}, {size})."
+            ) from error
         if array.shape not in ((K, size), (chains, K, size)):
             raise DraxError(
                 f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
@@ -517,12 +528,73 @@ def initial_knots(
 _draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))
 
 
-def _require_finite(problem: Problem, info: Info) -> None:
+def _require_finite(flow: Langevin, problem: Problem, state: State, info: Info) -> None:
     """Complain if no chain could possibly start."""
     for label, values in (("cost", info.cost), ("dynamics", info.max_defect)):
         if not np.isfinite(values).any():
+            _require_sound(flow, problem, state.trajectory)
             raise DraxError(
                 f"the {label} of {problem.name} is {float(values[0])} at the initial knots of "
                 f"every chain ({len(values)} tried): make it finite there (no 0/0, no log or sqrt "
                 "of negative numbers), or narrow the scatter of the initial knots."
             )
+
+
+def _require_sound(flow: Langevin, problem: Problem, knots: Trajectory) -> None:
+    """Complain about a function that is finite, with its derivatives, for no chain's knots.
+
+    Those of a stage are tried at x_init, where every chain stays, and its first control; those of
+    the end at its last state.
+
+    Raises:
+        DraxError: naming the function, where it fails and the fix.
+    """
+    by = getattr(flow.preconditioner, "derivatives", None)
+    finite = _soundness(
+        replace(flow, scale=Scale()), problem, knots, by is None or isinstance(by, Autodiff)
+    )
+    for label, *_ in functions_of(problem):
+        for what, good in zip(
+            ("value", "derivative", "second derivative"), finite[label], strict=True
+        ):
+            if not np.asarray(good).any():
+                at = "the initial points"
+                if problem.dynamics.nx:
+                    at = "the last initial state" if label.startswith("terminal") else "x_init"
+                raise DraxError(
+                    f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
+                    "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
+                    "move x_init or the scatter of initial knots."
+                )
+
+
+@partial(jax.jit, static_argnames="exact")
+def _soundness(
+    flow: Langevin, problem: Problem, knots: Trajectory, exact: bool
+) -> dict[str, list[Array]]:
+    """Whether functions, first and second derivatives are finite, (chains,) each."""
+    dynamics = problem.dynamics
+    inside = jax.vmap(partial(flow.bounds.interior, problem.bounds))(replace(knots, slack=None))
+    found = {}
+    for label, function, arguments, _ in functions_of(problem):
+        of_f, of_end = function == dynamics.step, len(arguments) == 1
+
+        def value(
+            z: Array, function: Any = function, of_f: bool = of_f, of_end: bool = of_end
+        ) -> Array:
+            x, u = z[: dynamics.nx], z[dynamics.nx :]
+            if of_f:
+                return function(x, u)
+            seen = dynamics.observe(x, jnp.zeros_like(u) if of_end else u)
+            return jnp.ravel(function(seen) if of_end else function(seen, u))
+
+        orders = [value]
+        if exact:
+            orders.append(jax.jacfwd(value))
+            orders += [jax.jacfwd(orders[1])] * label.endswith("cost")
+        u = inside.u[:, 0]
+        start = jnp.broadcast_to(problem.x_init, (len(u), dynamics.nx))
+        z = jnp.concatenate([inside.x[:, -1] if of_end else start, u], axis=1)
+        good = [jax.vmap(lambda z, f=f: jnp.isfinite(f(z)).all())(z) for f in orders]
+        found[label] = good + good[-1:] * (3 - len(good))
+    return found

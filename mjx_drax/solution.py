@@ -309,7 +309,7 @@ def solve(
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
-    solver = solver or Restarts()
+    solver = Restarts() if solver is None else solver
     recorder = None if record is None else Recorder(record)
     found = run(problem, chains, seed, solver, guess, progress, recorder, devices)
     solution = _certified(problem, solver, seed, found)
