@@ -33,7 +33,7 @@ from mjx_drax.functions import require_functions, require_shape, traced
 from mjx_drax.scalar import pruned
 
 MOST = 1_000_000
-"""Most knots of a horizon."""
+"""Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
 CLOSE = 0.03
 """Smallest factor on the scatter of initial knots where f has kinks or states quaternions."""
@@ -549,6 +549,8 @@ def from_function(
     if f is None:
         raise DraxError("f is None: give the dynamics, a function f(x, u) -> x_next.")
     require_whole("nu", nu)
+    if nu > MOST:
+        raise DraxError(f"nu is {nu}, the size of a control: give at most {MOST:,}.")
     require_name(name)
     K = knots(horizon, dt)
     x_init = vector("x_init", x_init)
@@ -673,7 +675,8 @@ def checked(problem: Problem) -> Problem:
     if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
         raise DraxError(f"{name} has no cost: give a running or a terminal one.")
     for label, function, arguments, shape in functions_of(problem):
-        require_shape(label, function, arguments, shape)
+        if function != dynamics.step or not hasattr(dynamics, "mj_model"):  # MJX's takes a second
+            require_shape(label, function, arguments, shape)
     _check_guess(problem)
     problem.reached(np.asarray(problem.x_init, float))
     return problem

@@ -217,7 +217,7 @@ class At:
     def saved_digest(self, path):
         said = json.loads((path.parent / "result.json").read_text())
         said["npz_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        del said["json_sha256"]
+        said.pop("json_sha256", None)
         (path.parent / "result.json").write_text(json.dumps(said))
         return path.parent
 
@@ -347,6 +347,7 @@ ARGUMENTS = [
     ("nu-0", lambda at: point(nu=0), "nu is 0", "at least 1"),
     ("nu-negative", lambda at: point(nu=-2), "nu is -2"),
     ("nu-text", lambda at: point(nu="2"), "nu is '2'"),
+    ("nu-huge", lambda at: point(nu=10**12), "nu is 1000000000000", "at most"),
     ("nu-half", lambda at: point(nu=1.5), "nu is 1.5"),
     ("name-number", lambda at: point(name=3), "name is 3"),
     ("name-empty", lambda at: robot(name=""), "name is ''"),
@@ -1116,9 +1117,9 @@ CASES = [
 ]
 
 FIXES = re.compile(
-    r"\b(add|call|change|check|choose|clear|correct|drive|give|install|keep|leave|load|make|map|move|"
-    r"must|narrow|needs|pass|remove|rename|return|route|scale|see|set|solve|stack|there is|undo|use|"
-    r"widen)\b",
+    r"\b(add|call|change|check|choose|clear|correct|drive|give|install|keep|leave|load|make|map|"
+    r"move|must|narrow|needs|pass|remove|rename|return|route|scale|see|set|solve|stack|there is|"
+    r"undo|use|widen)\b",
     re.IGNORECASE,
 )
 """Words that say what to do; where names are listed, that is what to choose from."""
