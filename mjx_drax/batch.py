@@ -285,7 +285,8 @@ def solve_batch(
     Where f has kinks (contacts), chains are not led on along replays as `solve` does.
 
     Raises:
-        DraxError: as `solve`; values without a common first axis; a model that varies, which the C
+        DraxError: as `solve`; values without a common first axis; a problem with NaN, crossed
+            bounds or an x_init outside of them, by its number; a model that varies, which the C
             engine would not replay.
     """
     if chunk is not None:

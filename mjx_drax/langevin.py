@@ -183,19 +183,30 @@ class Langevin:
             require_part("preconditioner.derivatives", by, "jacobian", "Autodiff()")
         _check_numbers(self)
         self._check_adjusted(problem)
-        if not self.adjusted:  # a Metropolis step heeds values too
-            self._check_derivatives(problem)
+        self._check_derivatives(problem)
+
+    def forward(self, problem: Problem) -> bool:
+        """Whether a problem's functions are differentiated exactly, in forward mode.
+
+        `Identity` and `LBFGS` differentiate in reverse, but feedback gains come after any flow; a
+        Metropolis step heeds values, so its costs may have jumps.
+        """
+        by = getattr(self.preconditioner, "derivatives", None)
+        exact = by is None or isinstance(by, Autodiff)
+        reverse = isinstance(self.preconditioner, Identity | LBFGS)
+        return exact and not self.adjusted and (not reverse or problem.dynamics.nx > 0)
 
     def _check_derivatives(self, problem: Problem) -> None:
         """Complain about functions of the problem that cannot be differentiated as they will be."""
         by = getattr(self.preconditioner, "derivatives", None)
-        exact = by is None or isinstance(by, Autodiff)
-        dynamics = problem.dynamics
-        reverse = exact and isinstance(self.preconditioner, Identity | LBFGS)
-        forward = not reverse or dynamics.nx > 0  # feedback gains are computed after any flow
+        if self.adjusted or not (by is None or isinstance(by, Autodiff)):
+            return
+        dynamics, forward = problem.dynamics, self.forward(problem)
+        reverse = isinstance(self.preconditioner, Identity | LBFGS)
         for label, function, arguments, _ in functions_of(problem):
-            of_f = function == dynamics.step
-            if not exact or (of_f and (dynamics.derivatives or hasattr(dynamics, "mj_model"))):
+            if function == dynamics.step and (
+                dynamics.derivatives is not None or hasattr(dynamics, "mj_model")
+            ):
                 continue
             twice = forward and label.endswith("cost")
             require_derivatives(label, function, arguments, forward, twice, reverse)

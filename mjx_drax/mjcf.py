@@ -476,7 +476,8 @@ def from_mjcf(
         name: used in files and tables; by default the model's name.
 
     Raises:
-        DraxError: the model cannot be used (saying which element and why), or arguments misfit.
+        DraxError: the model cannot be used (saying which element and why), or arguments misfit; a
+            function computes something else when it is traced again.
 
     Warns:
         DraxWarning: MJX computes the model a little differently from the C engine.

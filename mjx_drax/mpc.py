@@ -230,7 +230,7 @@ class MPC:
         Everything that later plans need is compiled here too.
 
         Raises:
-            DraxError: x does not fit the problem.
+            DraxError: x does not fit the problem, or is not finite; nor is t.
         """
         problem = self.problem.with_x_init(x)
         _require_time(t)

@@ -531,7 +531,8 @@ def from_function(
         name: used in files and tables.
 
     Raises:
-        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one.
+        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one; a function
+            that computes something else when it is traced again.
     """
     require_functions(
         f=f,

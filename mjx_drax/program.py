@@ -118,7 +118,8 @@ def minimize(
     """Solve a program from `from_program`; `guess` (n,) or (chains, n) replaces random points.
 
     Raises:
-        DraxError: sizes that misfit, or a cost that is not finite at any initial point.
+        DraxError: sizes that misfit; functions that cannot be differentiated, or are finite, with
+            their derivatives, at no initial point.
     """
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:

@@ -304,7 +304,8 @@ def solve(
         the solution with its certificate; look at `solution.certified`.
 
     Raises:
-        DraxError: sizes that misfit, or a cost or dynamics that are not finite at any initial knot.
+        DraxError: sizes that misfit; functions that cannot be differentiated, compute something
+            else each time, or are finite, with their derivatives, at no initial knot.
     """
     problem = checked(problem)
     if problem.dynamics.nx == 0:

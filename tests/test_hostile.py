@@ -1298,3 +1298,60 @@ def test_bad_commands_give_one_line(arguments, words, tmp_path, capsys):
     for word in words:
         assert word in line, line
     assert printed.out == ""
+
+
+NOTED = []
+
+
+def noting(x, u):
+    """Keeps count without reading it."""
+    NOTED.append(1)
+    return x @ x
+
+
+def jumps(x, u):
+    """As no exact derivative follows it."""
+    return jnp.round(x).sum()
+
+
+SAMPLED = Langevin(preconditioner=GaussNewton(derivatives=Smoothed()))
+
+
+@pytest.mark.parametrize(
+    ("cost", "solver"),
+    [
+        (lambda x, u: 1.0, Restarts()),
+        (lambda x, u: jnp.zeros(()), Restarts()),
+        (lambda x, u: jax.nn.relu(x).sum() + jnp.abs(u).sum(), Restarts()),
+        (lambda x, u: jnp.where(x > 0, x, 0.0).sum(), Restarts()),
+        (lambda x, u: jax.lax.cond(x[0] > 0, jnp.sum, jnp.prod, x), Restarts()),
+        (lambda x, u: jumps(x, u) + u @ u, Restarts()),
+        (noting, Restarts()),
+        (called_back, SAMPLED),
+        (jumps, SAMPLED),
+        (jumps, Langevin(preconditioner=Identity(), adjusted=True)),
+    ],
+    ids=[
+        "constant",
+        "zero",
+        "relu",
+        "where",
+        "cond",
+        "partly",
+        "notes",
+        "callback",
+        "jumps",
+        "law",
+    ],
+)
+def test_what_only_looks_bad_is_accepted(cost, solver):
+    solver.check(point(running_cost=cost))
+
+
+def test_a_reverse_rule_is_enough_for_a_flow_that_needs_no_other():
+    Langevin(preconditioner=LBFGS()).check(from_program(2, cost=backwards))
+
+
+@pytest.mark.parametrize("bounds", [None, (-INF, INF), (-INF, 1.0), np.array([[-1, -1], [1, 1]])])
+def test_bounds_that_leave_room_are_accepted(bounds):
+    assert np.isfinite(point(x_bounds=bounds).scatter.x_upper).all()
