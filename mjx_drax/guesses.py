@@ -152,7 +152,10 @@ def spread(
     K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
     if not isinstance(trajectory, Trajectory):
         raise DraxError(f"the trajectory is {shown(trajectory)}: give a Trajectory(x, u).")
-    x, u = np.asarray(trajectory.x, float), np.asarray(trajectory.u, float)
+    try:
+        x, u = numbers(trajectory.x), numbers(trajectory.u)
+    except (TypeError, ValueError) as error:
+        raise DraxError(f"the trajectory is {shown(trajectory)}: give numbers.") from error
     if x.shape != (K, nx) or u.shape != (K, nu):
         raise DraxError(
             f"the trajectory has shapes {x.shape} and {u.shape}: give x ({K}, {nx}) and "

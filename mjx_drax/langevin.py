@@ -46,7 +46,7 @@ from mjx_drax.precondition import (
     augmented_lagrangian,
     displaced,
 )
-from mjx_drax.problem import Problem, Stagewise, Trajectory, functions_of
+from mjx_drax.problem import Problem, Stagewise, Trajectory, functions_of, numbers
 from mjx_drax.quasi_newton import LBFGS
 from mjx_drax.scalar import pruned
 from mjx_drax.schedules import Constant, Geometric
@@ -466,9 +466,12 @@ def _check_numbers(part: Any, prefix: str = "") -> None:
         elif setting.name in _COUNTS:
             require_whole(name, value)
         elif value is not None and not callable(value):
-            number = np.asarray(value)
+            try:
+                number = numbers(value)
+            except (TypeError, ValueError):
+                number = np.array(np.nan)
             positive = setting.name in _POSITIVE
-            good = number.shape == () and number.dtype.kind in "biuf" and np.isfinite(number)
+            good = number.shape == () and np.isfinite(number)
             if not good or number < 0 or (positive and number == 0):
                 least = "greater than 0" if positive else "of at least 0"
                 raise DraxError(f"{name} is {shown(value)}: give a finite number {least}.")

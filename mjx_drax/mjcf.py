@@ -494,6 +494,8 @@ def from_mjcf(
         goal=goal,
         guess=guess,
     )
+    if not isinstance(contacts, bool | np.bool_):
+        raise DraxError(f"contacts is {shown(contacts)}: give True or False.")
     if derivatives is not None:
         require_part("derivatives", derivatives, "jacobian", "Smoothed()")
     host = load(model)

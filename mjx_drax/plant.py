@@ -16,7 +16,7 @@ from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError, is_number, require_not_negative, require_positive, shown
 from mjx_drax.host import Floats, integrate, set_state
 from mjx_drax.mjcf import index
-from mjx_drax.problem import Problem
+from mjx_drax.problem import Problem, numbers
 
 LASTS = 0.1
 """How long a push lasts [s], unless it says otherwise."""
@@ -123,7 +123,7 @@ def _require_push(push: object) -> None:
     if not isinstance(push, Push):
         raise DraxError(f"a push is {shown(push)}: give a Push(time, body, force).")
     try:
-        force = np.asarray(push.force, float)
+        force = numbers(push.force)
     except (TypeError, ValueError):
         force = np.array(np.nan)
     if force.shape != (3,) or not np.isfinite(force).all():

@@ -596,7 +596,10 @@ def numbers(value: ArrayLike) -> np.ndarray:
     array = np.asarray(value)
     if array.dtype.kind in "USc":  # strings would be parsed, imaginary parts dropped
         raise TypeError(f"{array.dtype} holds no real numbers")
-    return np.asarray(array, float)
+    try:
+        return np.asarray(array, float)
+    except OverflowError as error:  # of Python's own whole numbers
+        raise ValueError(str(error)) from error
 
 
 def vector(label: str, value: ArrayLike) -> Array:

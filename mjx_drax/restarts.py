@@ -508,7 +508,8 @@ def initial_knots(
     knots = []
     for label, value, size in (("x", guess.x, nx), ("u", guess.u, nu)):
         try:
-            array = np.asarray(numbers(value), problem.x_init.dtype)
+            with np.errstate(over="ignore"):  # what float32 cannot hold is refused as infinite
+                array = np.asarray(numbers(value), problem.x_init.dtype)
         except (TypeError, ValueError) as error:
             raise DraxError(
                 f"guess.{label} is {shown(value)}: give numbers of shape ({K}, {size})."

@@ -361,6 +361,7 @@ ARGUMENTS = [
     ("x_init-none", lambda at: point(x_init=None), "x_init is None"),
     ("x_init-objects", lambda at: point(x_init=[object(), None]), "x_init is [<object"),
     ("x_init-dict", lambda at: point(x_init={"x": 0}), "x_init is {'x': 0}"),
+    ("x_init-endless", lambda at: point(x_init=[10**400, 0]), "x_init is [1000000", "..."),
     ("x_init-ragged", lambda at: point(x_init=[[0.0], [0.0, 1.0]]), "x_init is [[0.0]"),
     ("x_init-complex", lambda at: point(x_init=[0j, 1.0]), "x_init", "numbers"),
     ("x_init-huge", lambda at: point(x_init=np.full((99, 99), NAN)), "x_init is array", "..."),
@@ -391,6 +392,7 @@ ARGUMENTS = [
     ("scatter-nan", lambda at: point(u_scatter=(NAN, NAN)), "lower end of u is nan"),
     ("scatter-text", lambda at: point(u_scatter="wide"), "bounds of u are 'wide'"),
     ("no-cost", lambda at: point(terminal_residual=None), "point has no cost", "give"),
+    ("contacts", lambda at: robot(contacts="some"), "contacts is 'some'", "True or False"),
     ("derivatives-class", lambda at: robot(derivatives=Smoothed), "derivatives", "Smoothed()"),
     ("derivatives-text", lambda at: robot(derivatives="exact"), "derivatives is 'exact'"),
     ("problem-none", lambda at: solve(None), "the problem is None", "from_mjcf"),
@@ -639,6 +641,7 @@ SETTINGS = [
     ("nothing-to-do", lambda at: flow(iterations=0, tail=0), "iterations + tail is 0", "give"),
     ("step_size-negative", lambda at: flow(step_size=-0.1), "step_size is -0.1"),
     ("step_size-nan", lambda at: flow(step_size=NAN), "step_size is nan"),
+    ("step_size-ragged", lambda at: flow(step_size=[[0.1], [0.2, 0.3]]), "step_size is [[0.1]"),
     ("step_size-vector", lambda at: flow(step_size=[0.1, 0.2]), "step_size is [0.1, 0.2]"),
     ("noise-number", lambda at: flow(noise=0.1), "noise is 0.1", "Constant(0.1)"),
     ("noise-nan", lambda at: flow(noise=Geometric(NAN, 0.1)), "noise.start is nan"),
@@ -891,6 +894,8 @@ TERMS = [
      "seed is -1"),
     ("spread-shape", lambda at: guesses.spread(at.robot, guesses.still(at.point), 2),
      "(10, 2)", "x (5, 2)"),
+    ("spread-texts", lambda at: guesses.spread(at.robot, Trajectory("x", "u"), 2),
+     "Trajectory(x='x'"),
     ("spread-tuple", lambda at: guesses.spread(at.robot, (0, 0), 2), "trajectory is (0, 0)"),
 ]
 # fmt: on
