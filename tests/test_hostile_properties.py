@@ -1,6 +1,6 @@
 """Whatever is given: it is accepted, or a DraxError says why not; nothing else is ever raised.
 
-The examples are the same in every run. MJCF goes to MuJoCo's own parser, in C++: thirty thousand
+The examples are the same in every run. MJCF goes to MuJoCo's own parser, in C++: four thousand
 mutations of a model were tried in a process of their own and none of them ended it.
 """
 
