@@ -25,7 +25,8 @@ from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
 from mjx_drax.devices import SPLIT, divided, mesh_for, spread
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, reason, require_whole, shown
+from mjx_drax.functions import plain, require_functions
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking, worth
 from mjx_drax.problem import Problem, Trajectory, checked
 from mjx_drax.restarts import (
@@ -69,6 +70,14 @@ class Family:
             DraxError: leaves of `values` without a common first axis, or a misfit in the first
                 problem.
         """
+        if not callable(make):
+            raise DraxError(f"make is {shown(make)}: give a function of a value, to a Problem.")
+        try:
+            values = jax.tree.map(jnp.asarray, values)
+        except (TypeError, ValueError) as error:
+            raise DraxError(
+                f"values are {shown(values)}: give arrays of numbers, one entry for each problem."
+            ) from error
         counts = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
         if len(counts) != 1 or not min(counts) or min(counts)[0] < 1:
             raise DraxError(
@@ -78,23 +87,43 @@ class Family:
         count = min(counts)[0]
 
         def nth(i: int) -> Problem:
-            return make(jax.tree.map(lambda leaf: leaf[i], values))
+            try:
+                return make(jax.tree.map(lambda leaf: leaf[i], values))
+            except DraxError:
+                raise
+            except Exception as error:
+                raise DraxError(
+                    f"make failed for value {i}: {reason(error)}. Make it a function of one value "
+                    "that returns a Problem."
+                ) from error
 
         first, last = checked(nth(0)), nth(count - 1)
         leaves, others = jax.tree.leaves(first), jax.tree.leaves(last)
         if len(leaves) != len(others):
             raise DraxError("make gives problems of different structure: vary numbers only.")
         differs = tuple(a is not b for a, b in zip(leaves, others, strict=True))
+        if not any(differs):
+            raise DraxError(
+                "make gives the same problem for every value: let it change some number."
+            )
         tree: list[Any] = []
 
         @jax.jit
         @jax.vmap
         def differing(value: Any) -> list[Array]:
-            found, structure = jax.tree.flatten(make(value))
+            try:
+                found, structure = jax.tree.flatten(make(value))
+            except Exception as error:  # numbers were no trouble, above
+                ours = isinstance(error, DraxError)
+                words = "what it builds takes numbers, not traced values" if ours else plain(error)
+                raise DraxError(
+                    f"make failed when it was traced: {words}. Make it a JAX function, "
+                    "such as lambda x: dataclasses.replace(problem, x_init=x)."
+                ) from error
             tree.append(structure)
             return [jnp.asarray(a) for a, d in zip(found, differs, strict=True) if d]
 
-        stacked = iter(differing(jax.tree.map(jnp.asarray, values)))
+        stacked = iter(differing(values))
         merged = [next(stacked) if d else a for a, d in zip(leaves, differs, strict=True)]
         family = cls(jax.tree.unflatten(tree[0], merged), differs, count)
         if family.varies("dynamics") and hasattr(first.dynamics, "mj_model"):
@@ -102,7 +131,26 @@ class Family:
                 f"make changes the dynamics of {first.name}, and the C engine would "
                 "replay another: solve for each model by itself."
             )
+        family._check()
         return family
+
+    def _check(self) -> None:
+        """Complain about numbers of single problems that no solve could use."""
+        leaves = zip(jax.tree.leaves(self.problem), self.differs, strict=True)
+        numbers = [np.asarray(leaf) for leaf, differs in leaves if differs]
+        nan = np.any([np.isnan(n).reshape(self.count, -1).any(1) for n in numbers], axis=0)
+        faults = np.asarray(self.over(_faults)(self.problem))
+        for wrong, words in (
+            (nan, "holds NaN: give numbers"),
+            (faults[:, 0], "starts at infinity: give a finite x_init"),
+            (faults[:, 1], "has bounds that cross: give lower <= upper"),
+            (faults[:, 2], "starts outside the bounds of x: move its x_init, or widen the bounds"),
+        ):
+            if wrong.any():
+                raise DraxError(
+                    f"problem {int(np.argmax(wrong))} of {self.count} ({int(wrong.sum())} such) "
+                    f"{words}."
+                )
 
     def _changed(self, change: Callable[[Any], Any]) -> Problem:
         """The problem with another value for each leaf that differs."""
@@ -136,6 +184,19 @@ class Family:
             return jax.vmap(function, in_axes=(axes, *[0] * len(arguments)))(problem, *arguments)
 
         return mapped
+
+
+def _faults(problem: Problem) -> Array:
+    """Whether x_init is not finite, bounds cross, and x_init is outside of them, (3,)."""
+    box, x = problem.bounds, problem.x_init
+
+    def above(lower: Array, upper: Array) -> Array:
+        return (lower - upper > 1e-6).any()
+
+    crossed = above(box.x_lower, box.x_upper) | above(box.u_lower, box.u_upper)
+    outside = above(box.x_lower, x) | above(x, box.x_upper)
+    alike = box.x_lower.ndim == box.x_upper.ndim == 1  # bounds of single knots do not hold for x_0
+    return jnp.stack([~jnp.isfinite(x).all(), crossed, outside & alike])
 
 
 jax.tree_util.register_dataclass(Family, data_fields=["problem"], meta_fields=["differs", "count"])
@@ -226,14 +287,17 @@ def solve_batch(
     Where f has kinks (contacts), chains are not led on along replays as `solve` does.
 
     Raises:
-        DraxError: as `solve`; values without a common first axis; a model that varies, which the C
+        DraxError: as `solve`; values without a common first axis; a problem with NaN, crossed
+            bounds or an x_init outside of them, by its number; a model that varies, which the C
             engine would not replay.
     """
-    if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
-        raise DraxError(f"chunk is {chunk!r}: give a whole number of at least 1.")
+    if chunk is not None:
+        require_whole("chunk", chunk)
+    require_whole("chains", chains)
+    require_functions(progress=progress)
     family = Family.of(make, values)
     first = family.at(0)
-    solver = as_restarts(first, chains, seed, solver or Restarts())
+    solver = as_restarts(first, chains, seed, Restarts() if solver is None else solver)
     file = None if checkpoint is None else Checkpoint(checkpoint)
     size = chunk or (file and file.answered("chunk")) or fitting(first, chains)
     size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()

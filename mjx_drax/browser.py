@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mjx_drax._mujoco import mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_whole
 from mjx_drax.files import complete, require
 from mjx_drax.host import finite, set_state
 from mjx_drax.painter import Mesh, color, mesh_of, model_mesh, primitive
@@ -90,8 +90,7 @@ def save_html(solution: Solution, path: str | os.PathLike[str], ghosts: int = GH
             a path that cannot be written.
     """
     require_viewer(solution.problem)
-    if not isinstance(ghosts, int | np.integer) or ghosts < 0:
-        raise DraxError(f"ghosts is {ghosts!r}: give a whole number of at least 0.")
+    require_whole("ghosts", ghosts, 0)
     with complete(path, (".html", ".htm")) as partial:
         partial.write_text(_page(solution, _recorded(solution, int(ghosts))), encoding="utf-8")
     return Path(path).expanduser()

@@ -37,7 +37,7 @@ from jax.sharding import Mesh
 
 from mjx_drax import __version__
 from mjx_drax.errors import DraxError, DraxWarning
-from mjx_drax.files import complete
+from mjx_drax.files import complete, file_path
 from mjx_drax.files import require_room as require_room_for
 from mjx_drax.problem import Problem
 from mjx_drax.source import binary
@@ -76,7 +76,7 @@ class Checkpoint:
                 f"checkpoint is {str(path)!r}, and {jax.process_count()} processes cannot go on "
                 "from one file: leave it out, or solve in one process."
             )
-        self.path = Path(path).expanduser()
+        self.path = file_path(path)
         self.question: dict[str, Any] = {"format": FORMAT}
         self.found, self._asked = _read(self.path)
         self._due, self._warned = time.monotonic() + EVERY, False

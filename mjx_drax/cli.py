@@ -10,7 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import (
+    DraxError,
+    reason,
+    require_not_negative,
+)
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -280,17 +284,16 @@ def _add_exports(parser: argparse.ArgumentParser) -> None:
 
 
 def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is not at least 1")
-    return value
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a whole number of at least 1")
+    return int(text)
 
 
 def _size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT as (height, width)."""
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text!r} is not like 640x480")
+        raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT, such as 640x480")
     return int(height), int(width)
 
 
@@ -323,17 +326,17 @@ def _solve(options: argparse.Namespace) -> int:
         _own_problem(options) if options.task is None else _task(options)
     )
     from mjx_drax import results, settings
-    from mjx_drax.restarts import with_iterations
+    from mjx_drax.restarts import as_restarts, with_iterations
     from mjx_drax.solution import solve
 
     if options.iterations is not None:
         solver = with_iterations(solver, options.iterations)
     for name, value in map(_assignment, options.settings):
         solver = settings.changed(solver, name, value)
-    solver.check(problem)
+    chains = options.chains or chains
+    as_restarts(problem, chains, options.seed, solver)  # complains now
     exports = _exports(options)
     _require_exports(problem, exports)
-    chains = options.chains or chains
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = {n: getattr(options, n) for n in ("camera", "size", "fps", "speed")}
@@ -389,13 +392,14 @@ def _mpc(options: argparse.Namespace) -> int:
     from mjx_drax.mpc import MPC
     from mjx_drax.plant import Plant
 
-    if options.pushes < 0:
-        raise DraxError(f"--pushes is {options.pushes}: give a number of at least 0.")
     problem = _made(tasks.load(options.task), options.horizon)
     names = ("chains", "explorers", "iterations", "every", "hold", "seed")
     policy = MPC(problem, **{name: getattr(options, name) for name in names})
-    duration = options.duration or float(problem.times[-1]) + 8.0
+    usual = float(problem.times[-1]) + 8.0
+    duration = usual if options.duration is None else options.duration
+    require_not_negative("push", options.push)
     trials = loop.Trials(policy, duration, options.realtime)
+    trials.check(options.runs, options.pushes)
     errors = {name: getattr(options, name) for name in ("mass", "noise", "shaking")}
     Plant(problem, **errors)  # complains now
     if options.video:
@@ -623,7 +627,7 @@ def _load_cost_file(path: Path) -> Any:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise DraxError(
-            f"the cost file {str(path)!r} failed: {type(error).__name__}: {error}"
+            f"the cost file {str(path)!r} failed: {reason(error)}. Correct it there."
         ) from error
     finally:
         sys.path.pop(0)

@@ -45,13 +45,20 @@ def mesh_for(count: int, devices: int | None) -> Mesh | None:
     count //= processes
     if devices is None:
         devices = max(n for n in range(1, len(present) + 1) if count % n == 0)
-    if not isinstance(devices, int | np.integer) or not 1 <= devices <= len(present):
+    if (
+        not isinstance(devices, int | np.integer)
+        or isinstance(devices, bool)
+        or not 1 <= devices <= len(present)
+    ):
         raise DraxError(
             f"devices is {devices!r}: give a whole number from 1 to {len(present)}, which is how "
             f"many {present[0].platform} devices there are."
         )
     if count % devices:
-        raise DraxError(f"{count} cannot be spread evenly over {devices} devices: give a multiple.")
+        raise DraxError(
+            f"{count} chains or problems cannot be spread evenly over {devices} devices: give a "
+            "multiple."
+        )
     return Mesh(np.array(present[:devices]), ("share",)) if devices > 1 else None
 
 

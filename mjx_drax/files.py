@@ -12,7 +12,23 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, shown
+
+
+def file_path(path: object) -> Path:
+    """The path of a file or folder, `~` being the user's home.
+
+    Raises:
+        DraxError: it is no path.
+    """
+    try:
+        target = Path(path).expanduser()  # type: ignore[arg-type]
+        os.fsencode(target)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DraxError(f"the path is {shown(path)}: give a text or a pathlib.Path.") from error
+    if "\0" in str(target):
+        raise DraxError(f"the path is {shown(path)}: remove the null character.")
+    return target
 
 
 @contextlib.contextmanager
@@ -26,7 +42,7 @@ def complete(path: str | os.PathLike[str], suffixes: tuple[str, ...] = ()) -> It
     Raises:
         DraxError: it ends otherwise, or cannot be written.
     """
-    target = Path(path).expanduser()
+    target = file_path(path)
     if suffixes and target.suffix.lower() not in suffixes:
         raise DraxError(f"{target.name!r} does not end in {' or '.join(suffixes)}: rename it.")
     if target.is_dir():

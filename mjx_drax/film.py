@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from mjx_drax import movie
 from mjx_drax._mujoco import mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_positive, require_whole
 from mjx_drax.ghosts import Stage, places, travelling_body
 from mjx_drax.host import between, finite, interpolated, moved
 from mjx_drax.langevin import FEASIBLE
@@ -94,9 +94,11 @@ def render_diffusion(
             "solve(..., record=1), or mjx-drax solve --film FILE."
         )
     check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
-    for name, value in (("seconds", seconds), ("ghosts", ghosts), ("chains", chains)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise DraxError(f"{name} must be positive, not {value}")
+    if seconds is not None:
+        require_positive("seconds", seconds)
+    if ghosts is not None:
+        require_whole("ghosts", ghosts)
+    require_whole("chains", chains)
     shown = [recording.path(chain) for chain in _chains(solution, chains)]
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from mjx_drax import movie
 from mjx_drax._mujoco import mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_whole
 from mjx_drax.host import finite, interpolated
 from mjx_drax.rendering import FREE, Floats, open_drawer, set_pose, view_of
 
@@ -123,8 +123,7 @@ def render_timelapse(
     """
     target = movie.film_path(path, (".png",))
     height, width = movie.even(size)
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise DraxError(f"count is {count!r}: give a whole number of poses, at least 1.")
+    require_whole("count", count)
     model = model_of(solution)
     qpos = finite(solution.replayed[0])[:, : model.nq]
     times = solution.problem.times[: len(qpos)]
@@ -142,7 +141,9 @@ def render_timelapse(
     try:
         image.save(target)
     except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
+        raise DraxError(
+            f"cannot write {target}: {error.strerror or error}; choose another place."
+        ) from error
     return target
 
 

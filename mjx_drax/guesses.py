@@ -26,10 +26,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mjx_drax._mujoco import mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import (
+    DraxError,
+    require_not_negative,
+    require_positive,
+    require_whole,
+    shown,
+)
 from mjx_drax.host import between, interpolated, moved, set_state
 from mjx_drax.mjcf import index
-from mjx_drax.problem import Box, Problem, Trajectory
+from mjx_drax.problem import Box, Problem, Trajectory, numbers
 from mjx_drax.twin import moment_arms
 
 Pose = str | ArrayLike
@@ -57,9 +63,12 @@ def waypoints(problem: Problem, poses: Iterable[tuple[float, Pose]]) -> Trajecto
     """
     model = _model(problem)
     given: dict[float, np.ndarray] = {}
-    for time, pose in poses:
-        if not (isinstance(time, float | int | np.number) and np.isfinite(time) and time >= 0):
-            raise DraxError(f"time of a waypoint is {time!r}: give seconds, not negative.")
+    try:
+        pairs = [(time, pose) for time, pose in poses]
+    except (TypeError, ValueError) as error:
+        raise DraxError(f"the poses are {shown(poses)}: give pairs (time [s], pose).") from error
+    for time, pose in pairs:
+        require_not_negative("time of a waypoint", time)
         if float(time) in given:
             raise DraxError(f"two waypoints are at {time} s: give each its own time.")
         given[float(time)] = _qpos(model, pose)
@@ -82,6 +91,8 @@ def keyframes(
     model = _model(problem)
     if isinstance(names, Mapping):
         return waypoints(problem, names.items())
+    if isinstance(names, str) or not (names is None or isinstance(names, Iterable)):
+        raise DraxError(f"names are {shown(names)}: give a list of keyframes, or {{time: name}}.")
     poses: Sequence[Pose] = list(model.key_qpos) if names is None else list(names)
     if not len(poses):
         raise DraxError(f"{problem.name} has no keyframe to go through: add some, or name some.")
@@ -105,16 +116,17 @@ def path(problem: Problem, qpos: ArrayLike, dt: float | None = None) -> Trajecto
     """
     model = _model(problem)
     try:
-        rows = list(np.asarray(qpos, float))
+        rows = list(numbers(qpos))
     except (TypeError, ValueError) as error:
-        raise DraxError(f"the path is {qpos!r}: give numbers of shape (T, {model.nq}).") from error
+        raise DraxError(
+            f"the path is {shown(qpos)}: give numbers of shape (T, {model.nq})."
+        ) from error
     poses = np.array([_qpos(model, row) for row in rows])
     if not len(poses):
         raise DraxError(f"the path is empty: give positions of shape (T, {model.nq}).")
     if dt is None:
         return _through(problem, np.linspace(0, float(problem.times[-1]), len(poses)), poses)
-    if not (isinstance(dt, float | int | np.number) and np.isfinite(dt) and dt > 0):
-        raise DraxError(f"dt of the path is {dt!r}: give a positive number of seconds.")
+    require_positive("dt of the path", dt, "a positive number of seconds")
     return _through(problem, dt * np.arange(len(poses)), poses)
 
 
@@ -138,14 +150,20 @@ def spread(
         DraxError: the trajectory has another shape; chains or scale are not positive.
     """
     K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
-    x, u = np.asarray(trajectory.x, float), np.asarray(trajectory.u, float)
+    if not isinstance(trajectory, Trajectory):
+        raise DraxError(f"the trajectory is {shown(trajectory)}: give a Trajectory(x, u).")
+    try:
+        x, u = numbers(trajectory.x), numbers(trajectory.u)
+    except (TypeError, ValueError) as error:
+        raise DraxError(f"the trajectory is {shown(trajectory)}: give numbers.") from error
     if x.shape != (K, nx) or u.shape != (K, nu):
         raise DraxError(
             f"the trajectory has shapes {x.shape} and {u.shape}: give x ({K}, {nx}) and "
             f"u ({K}, {nu})."
         )
-    if chains < 1 or not 0 < scale < np.inf:
-        raise DraxError(f"chains is {chains}, scale is {scale}: give positive numbers.")
+    require_whole("chains", chains)
+    require_whole("seed", seed, 0)
+    require_positive("scale", scale)
     rng, box = np.random.default_rng(seed), problem.scatter
     half_x, half_u = (
         scale * np.asarray(high - low, float) / 2
@@ -205,12 +223,14 @@ def _qpos(model: mujoco.MjModel, pose: Any) -> np.ndarray:
     if isinstance(pose, str):
         return np.array(model.key_qpos[index(model, "keyframe", pose)])
     try:
-        qpos = np.array(pose, float)
+        qpos = np.array(numbers(pose))
     except (TypeError, ValueError) as error:
-        raise DraxError(f"a pose is {pose!r}: give qpos, or the name of a keyframe.") from error
+        raise DraxError(
+            f"a pose is {shown(pose)}: give qpos, or the name of a keyframe."
+        ) from error
     if qpos.shape != (model.nq,) or not np.isfinite(qpos).all():
         raise DraxError(
-            f"a pose is {pose!r}, of shape {qpos.shape}: give {model.nq} finite numbers."
+            f"a pose is {shown(pose)}, of shape {qpos.shape}: give {model.nq} finite numbers."
         )
     mujoco.mj_normalizeQuat(model, qpos)
     return qpos

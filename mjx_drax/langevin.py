@@ -18,7 +18,7 @@ that turns non-finite is frozen where it last was finite and marked as diverged.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -30,8 +30,10 @@ from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.bounds import LogBarrier, Sides
+from mjx_drax.derivatives import Autodiff
 from mjx_drax.dynamics import Static
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_part, require_whole, shown
+from mjx_drax.functions import require_derivatives
 from mjx_drax.linalg import exact
 from mjx_drax.precondition import (
     Bounds,
@@ -44,7 +46,7 @@ from mjx_drax.precondition import (
     augmented_lagrangian,
     displaced,
 )
-from mjx_drax.problem import Problem, Stagewise, Trajectory
+from mjx_drax.problem import Problem, Stagewise, Trajectory, functions_of, numbers
 from mjx_drax.quasi_newton import LBFGS
 from mjx_drax.scalar import pruned
 from mjx_drax.schedules import Constant, Geometric
@@ -164,20 +166,50 @@ class Langevin:
             DraxError: naming the setting, its value and the fix.
         """
         for name in ("iterations", "tail"):
-            count = getattr(self, name)
-            if not isinstance(count, int | np.integer) or count < 0:
-                raise DraxError(f"{name} is {count!r}: give a whole number of at least 0.")
+            require_whole(name, getattr(self, name), 0)
         if self.iterations + self.tail < 1:
             raise DraxError("iterations + tail is 0: give at least 1.")
         for name in ("noise", "penalty", "damping", "barrier_weight"):
             schedule = getattr(self, name)
-            if not callable(schedule):
-                raise DraxError(f"{name} is {schedule!r}: give a schedule, Constant({schedule!r}).")
-        for name in ("preconditioner", "bounds"):
-            part = getattr(self, name)
-            if isinstance(part, type):
-                raise DraxError(f"{name} is a class: give an object, {part.__name__}().")
+            if not callable(schedule) or isinstance(schedule, type):
+                number = shown(schedule) if np.isscalar(schedule) else "0.1"
+                raise DraxError(
+                    f"{name} is {shown(schedule)}: give a schedule, Constant({number})."
+                )
+        require_part("preconditioner", self.preconditioner, "direction", "GaussNewton()")
+        require_part("bounds", self.bounds, "confine", "LogBarrier()")
+        if getattr(self.preconditioner, "derivatives", None) is not None:
+            by = self.preconditioner.derivatives  # type: ignore[union-attr]
+            require_part("preconditioner.derivatives", by, "jacobian", "Autodiff()")
+        _check_numbers(self)
         self._check_adjusted(problem)
+        self._check_derivatives(problem)
+
+    def forward(self, problem: Problem) -> bool:
+        """Whether a problem's functions are differentiated exactly, in forward mode.
+
+        `Identity` and `LBFGS` differentiate in reverse, but feedback gains come after any flow; a
+        Metropolis step heeds values, so its costs may have jumps.
+        """
+        by = getattr(self.preconditioner, "derivatives", None)
+        exact = by is None or isinstance(by, Autodiff)
+        reverse = isinstance(self.preconditioner, Identity | LBFGS)
+        return exact and not self.adjusted and (not reverse or problem.dynamics.nx > 0)
+
+    def _check_derivatives(self, problem: Problem) -> None:
+        """Complain about functions of the problem that cannot be differentiated as they will be."""
+        by = getattr(self.preconditioner, "derivatives", None)
+        if self.adjusted or not (by is None or isinstance(by, Autodiff)):
+            return
+        dynamics, forward = problem.dynamics, self.forward(problem)
+        reverse = isinstance(self.preconditioner, Identity | LBFGS)
+        for label, function, arguments, _ in functions_of(problem):
+            if function == dynamics.step and (
+                dynamics.derivatives is not None or hasattr(dynamics, "mj_model")
+            ):
+                continue
+            twice = forward and label.endswith("cost")
+            require_derivatives(label, function, arguments, forward, twice, reverse)
 
     def _check_adjusted(self, problem: Problem) -> None:
         """The part of `check` that `init` repeats, where counts may be traced."""
@@ -416,6 +448,35 @@ class Langevin:
     def _moved(self, problem: Problem, old: Trajectory, change: Trajectory) -> Trajectory:
         """The knots `old` moved along a tangent `change`, kept inside the bounds."""
         return self.bounds.confine(problem.bounds, old, displaced(problem, old, change))
+
+
+_POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
+
+
+def _check_numbers(part: Any, prefix: str = "") -> None:
+    """Complain about a setting that is no number, or one that makes no sense.
+
+    Raises:
+        DraxError: naming the setting, its value and the fix.
+    """
+    for setting in fields(part):
+        value, name = getattr(part, setting.name), prefix + setting.name
+        if is_dataclass(value):
+            _check_numbers(value, f"{name}.")
+        elif setting.name in _COUNTS:
+            require_whole(name, value)
+        elif value is not None and not callable(value):
+            try:
+                number = numbers(value)
+            except (TypeError, ValueError):
+                number = np.array(np.nan)
+            positive = setting.name in _POSITIVE
+            good = number.shape == () and np.isfinite(number)
+            if not good or number < 0 or (positive and number == 0):
+                least = "greater than 0" if positive else "of at least 0"
+                raise DraxError(f"{name} is {shown(value)}: give a finite number {least}.")
+            if setting.name == "fraction" and number >= 1:
+                raise DraxError(f"{name} is {shown(value)}: give a share below 1, such as 0.9.")
 
 
 def _with_slack(problem: Problem, trajectory: Trajectory) -> Trajectory:

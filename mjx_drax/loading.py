@@ -20,11 +20,21 @@ from jax.tree_util import Partial
 
 from mjx_drax._mujoco import mujoco
 from mjx_drax.dynamics import Dynamics, FunctionDynamics
-from mjx_drax.errors import DraxError, DraxWarning
+from mjx_drax.errors import (
+    DraxError,
+    DraxWarning,
+    reason,
+    require_positive,
+    require_whole,
+    shown,
+)
+from mjx_drax.files import file_path
+from mjx_drax.langevin import Langevin
 from mjx_drax.mjcf import HostModel, MjxDynamics, bounded_joints
 from mjx_drax.precondition import Multipliers
 from mjx_drax.problem import Aside, Box, Constraint, Cost, Problem, Stagewise, Trajectory
-from mjx_drax.results import ARRAYS, FORMAT, SUMMARY
+from mjx_drax.restarts import Restarts
+from mjx_drax.results import ARRAYS, FORMAT, SUMMARY, json_digest
 from mjx_drax.settings import from_data
 from mjx_drax.solution import Replays, Solution
 from mjx_drax.source import Source, from_binary
@@ -35,16 +45,20 @@ Arrays = dict[str, np.ndarray]
 
 def load(folder: str | os.PathLike[str], problem: Problem | None = None) -> Solution:
     """The solution in a folder; see `Solution.load`."""
-    path = Path(folder).expanduser()
+    path = file_path(folder)
     summary, arrays = _read(path)
     try:
         if problem is None:
             problem = _stand_in(summary, arrays)
         else:
             _require_same(problem, summary, arrays)
-        return _solution(problem, summary, arrays)
-    except (KeyError, TypeError) as error:
-        raise DraxError(f"{str(path / SUMMARY)!r} is damaged: {error!r}. Solve again.") from error
+        solution = _solution(problem, summary, arrays)
+        _require_consistent(solution, summary)
+        return solution
+    except DraxError:
+        raise
+    except Exception as error:  # what damaged data run into is beyond counting
+        raise DraxError(f"{shown(str(path))} is damaged: {reason(error)}. Solve again.") from error
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
@@ -61,24 +75,36 @@ def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
     try:
         summary = json.loads(contents[0])
         written = summary.get("format")
-    except (ValueError, AttributeError) as error:
+    except (ValueError, AttributeError, RecursionError) as error:
         raise DraxError(
-            f"{str(folder / SUMMARY)!r} is damaged, it is no JSON object: {error}. Solve again."
+            f"{str(folder / SUMMARY)!r} is damaged, it is no JSON object: {reason(error)}. Solve "
+            "again."
         ) from error
     if written != FORMAT:
         which = "no format number" if written is None else f"format {written}"
-        version = summary.get("versions", {}).get("mjx-drax", "unknown")
+        versions = summary.get("versions")
+        version = versions.get("mjx-drax") if isinstance(versions, dict) else "an unknown one"
         raise DraxError(
             f"{str(folder / SUMMARY)!r} has {which} (mjx_drax {version} wrote it), and this "
             f"version reads format {FORMAT}: solve again, or use the version that wrote it."
+        )
+    if summary.get("json_sha256", json_digest(summary)) != json_digest(summary):
+        raise DraxError(
+            f"{str(folder / SUMMARY)!r} is damaged, or was changed after it had been written: undo "
+            "that, remove its json_sha256, or solve again."
         )
     if hashlib.sha256(contents[1]).hexdigest() != summary.get("npz_sha256"):
         raise DraxError(
             f"{str(folder / ARRAYS)!r} does not belong to {SUMMARY} beside it: it is damaged, or "
             "saving was interrupted. Solve again."
         )
-    with np.load(io.BytesIO(contents[1]), allow_pickle=False) as arrays:
-        return summary, dict(arrays)
+    try:
+        with np.load(io.BytesIO(contents[1]), allow_pickle=False) as arrays:
+            return summary, dict(arrays)
+    except Exception as error:
+        raise DraxError(
+            f"{str(folder / ARRAYS)!r} is damaged: {reason(error)}. Solve again."
+        ) from error
 
 
 def _solution(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> Solution:
@@ -115,6 +141,44 @@ def _solution(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> Solu
         solve_time=summary["solve_time_s"],
         engine=summary["certificate"]["engine"],
     )
+
+
+def _require_consistent(solution: Solution, summary: dict[str, Any]) -> None:
+    """Complain about arrays that do not fit each other, and numbers of the wrong kind.
+
+    Raises:
+        DraxError: naming the first that does not fit.
+    """
+    x, u = solution.trajectories.x, solution.trajectories.u
+    dynamics = solution.problem.dynamics
+    chains, K, nx, nu = *x.shape, u.shape[-1]
+    shapes: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "x": (x, (chains, solution.problem.horizon, dynamics.nx)),
+        "u": (u, (chains, K, dynamics.nu)),
+        "gains": (solution.gains, (chains, K, nu, dynamics.ndx)),
+        "multipliers": (solution.multipliers.dynamics, (chains, K, dynamics.ndx)),
+    }
+    for name in ("cost", "max_defect", "max_violation", "converged_at", "died_at"):
+        shapes[name] = getattr(solution, name), (chains,)
+    for mode in ("open_loop", "feedback"):
+        replays = getattr(solution, mode)
+        shapes[f"{mode}.states"] = replays.states, (chains, K + 1, nx)
+        shapes[f"{mode}.controls"] = replays.controls, (chains, K, nu)
+        for name in ("max_deviation", "final_deviation", "max_violation", "cost", "success"):
+            shapes[f"{mode}.{name}"] = getattr(replays, name), (chains,)
+    for name, (array, shape) in shapes.items():
+        if array.shape != shape or array.dtype.kind not in "biuf":
+            raise DraxError(
+                f"the saved solution is damaged: {name} is {array.dtype} of shape {array.shape}, "
+                f"not numbers of shape {shape}. Solve again."
+            )
+    require_whole("horizon of the saved solution", summary["horizon"])
+    require_whole("seed of the saved solution", solution.seed, 0)
+    require_positive("dt of the saved solution", float(dynamics.dt))
+    if not isinstance(solution.solver, Langevin | Restarts):
+        raise DraxError(
+            f"the saved solution is damaged: its solver is {shown(solution.solver)}. Solve again."
+        )
 
 
 def _within(prefix: str, arrays: Arrays) -> Arrays:
@@ -212,6 +276,8 @@ def _model(summary: dict[str, Any], arrays: Arrays) -> HostModel:
 
 def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> None:
     """Complain if the problem cannot be the one that was solved."""
+    if not isinstance(problem, Problem):
+        raise DraxError(f"the problem is {shown(problem)}: give the one that was solved.")
     x, u = arrays["solution.trajectories.x"], arrays["solution.trajectories.u"]
     dynamics = problem.dynamics
     for label, given, saved in (

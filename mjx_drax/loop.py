@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.background import Background
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_positive, require_whole
 from mjx_drax.files import complete
 from mjx_drax.mpc import MPC, Statistics
 from mjx_drax.plant import Plant, Push, random_pushes
@@ -65,7 +65,11 @@ def simulate(
         realtime: the plant runs by the clock on the wall while a thread plans; else it waits for
             each plan.
         pushes: the plant's, to be reported.
+
+    Raises:
+        DraxError: the duration is not a positive number.
     """
+    require_positive("duration", duration, "a positive number of seconds")
     if realtime:
         with Background(policy) as background:
             return _driven(policy, background, plant, duration, True, pushes)
@@ -105,6 +109,23 @@ class Trials:
     realtime: bool
     motions: list[Motion] = field(default_factory=list)
 
+    def check(self, count: int, pushes: int) -> tuple[float, float]:
+        """Between which times pushes come [s]; call it before the policy is reset.
+
+        Raises:
+            DraxError: numbers that make no sense, or runs that leave no time for pushes.
+        """
+        require_whole("runs", count)
+        require_whole("pushes", pushes, 0)
+        require_positive("duration", self.duration, "a positive number of seconds")
+        begin, end = float(self.policy.problem.times[-1]), self.duration - SETTLE
+        if pushes and begin >= end:
+            raise DraxError(
+                f"a run of {self.duration:g} s leaves no time for pushes: they come after the "
+                f"horizon of {begin:g} s and {SETTLE:g} s before the end. Make it longer."
+            )
+        return begin, end
+
     def run(
         self,
         count: int,
@@ -123,12 +144,7 @@ class Trials:
             DraxError: the runs leave no time for pushes.
         """
         problem = self.policy.problem
-        begin, end = float(problem.times[-1]), self.duration - SETTLE
-        if pushes and begin >= end:
-            raise DraxError(
-                f"a run of {self.duration:g} s leaves no time for pushes: they come after the "
-                f"horizon of {begin:g} s and {SETTLE:g} s before the end. Make it longer."
-            )
+        begin, end = self.check(count, pushes)
         for i in range(count):
             hits = random_pushes(problem, pushes, push, (begin, end), seed + i) if pushes else []
             self.policy.rewind()

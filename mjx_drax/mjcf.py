@@ -24,7 +24,8 @@ from mjx_drax import agreement, physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, Differentiator, InScalars
 from mjx_drax.dynamics import Dynamics
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, cut, require_part, require_positive, shown
+from mjx_drax.functions import require_functions
 from mjx_drax.host import difference, set_state
 from mjx_drax.joints import Joints
 from mjx_drax.physics import mjx
@@ -38,6 +39,7 @@ from mjx_drax.problem import (
     constraints_of,
     cost_of,
     knots,
+    require_name,
     scatter_box,
     vector,
 )
@@ -359,20 +361,59 @@ def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
     """A model from a file, an XML string or a `mujoco.MjModel`.
 
     Raises:
-        DraxError: the file is missing or MuJoCo cannot compile it.
+        DraxError: the file is missing, MuJoCo cannot compile it, or it holds NaN.
     """
-    if isinstance(source, mujoco.MjModel):
-        return source
+    model = source if isinstance(source, mujoco.MjModel) else _compiled(source)
+    _require_finite(model)
+    return model
+
+
+def _compiled(source: str | Path) -> mujoco.MjModel:
     try:
-        if is_xml(source):
-            return mujoco.MjModel.from_xml_string(source)
-        if not Path(source).is_file():
-            raise DraxError(f"there is no model file {str(source)!r}: check the path.")
-        return mujoco.MjModel.from_xml_path(str(source))
-    except ValueError as error:
+        with _no_log_file():
+            if is_xml(source):
+                return mujoco.MjModel.from_xml_string(source)
+            if not Path(source).is_file():
+                is_folder = Path(source).is_dir()
+                what = "it is a folder; give a file in it" if is_folder else "check the path"
+                raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
+            return mujoco.MjModel.from_xml_path(str(source))
+    except TypeError as error:
+        raise DraxError(
+            f"the model is {shown(source)}: give an MJCF file, its XML as a text, or a "
+            "mujoco.MjModel."
+        ) from error
+    except (ValueError, OSError, mujoco.FatalError) as error:
         if isinstance(error, DraxError):
             raise
-        raise DraxError(f"MuJoCo cannot compile {str(source)[:80]!r}: {error}") from error
+        words = " ".join(str(error).split())
+        raise DraxError(
+            f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} Correct the MJCF."
+        ) from error
+
+
+_GIVEN = ("body_", "dof_", "jnt_", "geom_", "tendon_", "actuator_", "eq_", "qpos_spring", "key_")
+"""How arrays of a model are called that are as the MJCF says; those in 0 follow from others."""
+
+
+def _require_finite(model: mujoco.MjModel) -> None:
+    """Complain about numbers in a model that are none; MuJoCo itself only warns of them."""
+    if not (np.isfinite(model.opt.timestep) and model.opt.timestep > 0):
+        raise DraxError(
+            f"the timestep of {model_name(model)} is {model.opt.timestep} s: give a positive one, "
+            '<option timestep="0.01"/>.'
+        )
+    options = {f"opt.{name}": getattr(model.opt, name) for name in dir(model.opt)}
+    given = [name for name in dir(model) if name.startswith(_GIVEN) and not name.endswith("0")]
+    for name, value in {**options, **{name: getattr(model, name) for name in given}}.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            infinite_too = name in options  # ranges may be infinite
+            wrong = value[~np.isfinite(value) if infinite_too else np.isnan(value)]
+            if wrong.size:
+                raise DraxError(
+                    f"{name} of {model_name(model)} holds {wrong[0]}: give finite numbers in the "
+                    "MJCF."
+                )
 
 
 _COUNTS = {
@@ -395,8 +436,8 @@ def index(model: mujoco.MjModel, kind: str, name: str) -> int:
     element = getattr(model, "key" if kind == "keyframe" else kind)
     names = [element(i).name for i in range(getattr(model, _COUNTS[kind]))]
     if not isinstance(name, str) or not name or name not in names:
-        known = ", ".join(repr(n) for n in names if n) or "no named one"
-        raise DraxError(f"{model_name(model)} has no {kind} {name!r}: there is {known}.")
+        known = ", ".join(repr(n) for n in names if n) or "no named one; add one"
+        raise DraxError(f"{model_name(model)} has no {kind} {shown(name)}: there is {known}.")
     return names.index(name)
 
 
@@ -461,15 +502,34 @@ def from_mjcf(
         name: used in files and tables; by default the model's name.
 
     Raises:
-        DraxError: the model cannot be used (saying which element and why), or arguments misfit.
+        DraxError: the model cannot be used (saying which element and why), or arguments misfit; a
+            function computes something else when it is traced again.
 
     Warns:
         DraxWarning: MJX computes the model a little differently from the C engine.
     """
+    require_functions(
+        running_cost=running_cost,
+        terminal_cost=terminal_cost,
+        running_residual=running_residual,
+        terminal_residual=terminal_residual,
+        equality=equality,
+        inequality=inequality,
+        terminal_equality=terminal_equality,
+        terminal_inequality=terminal_inequality,
+        goal=goal,
+        guess=guess,
+    )
+    if not isinstance(contacts, bool | np.bool_):
+        raise DraxError(f"contacts is {shown(contacts)}: give True or False.")
+    if derivatives is not None:
+        require_part("derivatives", derivatives, "jacobian", "Smoothed()")
     host = load(model)
-    name = name or str(model_name(host))
+    name = str(model_name(host)) if name is None else name
+    require_name(name)
     require_movable(host, name)
     substeps = steps_between_knots(host, dt)
+    K = knots(horizon, substeps * host.opt.timestep)
     x0 = initial_state(host, name, x_init)
     bounded = bounded_joints(host, x0)
     dynamics = MjxDynamics(
@@ -495,7 +555,7 @@ def from_mjcf(
             bounds=bounds,
             scatter=_scatter(dynamics, bounds, x0, x_scatter, u_scatter),
             aside=Aside(goal, guess, name),
-            horizon=knots(horizon, dynamics.dt),
+            horizon=K,
         )
     )
 
@@ -517,8 +577,7 @@ def steps_between_knots(model: mujoco.MjModel, dt: float | None) -> int:
     timestep = model.opt.timestep
     if dt is None:
         return max(1, round(0.02 / timestep))
-    if not (isinstance(dt, float | int | np.number) and np.isfinite(dt) and dt > 0):
-        raise DraxError(f"dt is {dt!r}: give a positive number of seconds.")
+    require_positive("dt", dt, "a positive number of seconds")
     substeps = round(dt / timestep)
     if substeps < 1 or abs(substeps * timestep - dt) > 1e-6 * dt:
         raise DraxError(
@@ -531,7 +590,7 @@ def steps_between_knots(model: mujoco.MjModel, dt: float | None) -> int:
 def require_movable(model: mujoco.MjModel, name: str) -> None:
     """Raise a DraxError for a model that no trajectory can be planned for."""
     if model.nv == 0:
-        raise DraxError(f"{name} has no joints: there is nothing to move.")
+        raise DraxError(f"{name} has no joints: there is nothing to move; add a <joint>.")
     if model.nu == 0:
         raise DraxError(f"{name} has no actuators: add an <actuator>.")
 
@@ -545,10 +604,12 @@ def initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) ->
     else:
         x0 = np.concatenate([model.qpos0, np.zeros(model.nv + model.na)])
     nx = model.nq + model.nv + model.na
+    if not np.isfinite(x0).all():
+        raise DraxError(f"the first keyframe of {name} is {shown(x0.tolist())}: give x_init.")
     if x0.shape != (nx,):
         raise DraxError(
-            f"x_init has {x0.shape[0]} numbers; {name} has {nx}: "
-            f"qpos ({model.nq}), qvel ({model.nv}), act ({model.na})."
+            f"x_init has {x0.shape[0]} numbers; {name} has {nx}: qpos ({model.nq}), "
+            f"qvel ({model.nv}), act ({model.na}). Give {nx}."
         )
     for q, _ in Joints.of(model).quaternions:
         if abs(np.linalg.norm(x0[q : q + 4]) - 1.0) > 1e-3:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, shown
+from mjx_drax.files import file_path
 
 if TYPE_CHECKING:
     from PIL import Image, ImageFont
@@ -48,7 +49,9 @@ def write(
     try:
         partial.touch()
     except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
+        raise DraxError(
+            f"cannot write {target}: {error.strerror or error}; choose another place."
+        ) from error
     try:
         if target.suffix.lower() == ".mp4":
             _encode(partial, frames, fps, size)
@@ -103,9 +106,14 @@ def _with_palette(images: list[Image.Image]) -> list[Image.Image]:
 
 def even(size: tuple[int, int]) -> tuple[int, int]:
     """The size, rounded up to even numbers: yuv420p halves both sides."""
-    height, width = (int(side) for side in size)
-    if not (16 <= height <= 8192 and 16 <= width <= 8192):
-        raise DraxError(f"size (height, width) must lie within 16 and 8192 pixels, not {size}")
+    try:
+        height, width = (int(side) for side in size)
+    except (TypeError, ValueError, OverflowError):
+        height = width = 0
+    if isinstance(size, str) or not (16 <= height <= 8192 and 16 <= width <= 8192):
+        raise DraxError(
+            f"size is {shown(size)}: give (height, width), both within 16 and 8192 pixels."
+        )
     return height + height % 2, width + width % 2
 
 
@@ -115,16 +123,18 @@ def film_path(path: str | os.PathLike[str], suffixes: Sequence[str] = SUFFIXES) 
     Raises:
       DraxError: another suffix, a folder in its place, or none that it can lie in.
     """
-    target = Path(path).expanduser()
+    target = file_path(path)
     if target.suffix.lower() not in suffixes:
         known = " or ".join(suffixes)
         raise DraxError(f"this is written as {known}, not {target.name!r}: change the name.")
     if target.is_dir():
-        raise DraxError(f"cannot write {target}: it is a folder")
+        raise DraxError(f"cannot write {target}: it is a folder; give a file in it.")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DraxError(f"cannot write {target}: {error.strerror or error}") from error
+        raise DraxError(
+            f"cannot write {target}: {error.strerror or error}; choose another place."
+        ) from error
     return target
 
 

@@ -34,13 +34,19 @@ from jax import Array
 from jax.tree_util import Partial, register_dataclass
 from jax.typing import ArrayLike
 
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import (
+    DraxError,
+    is_number,
+    require_not_negative,
+    require_whole,
+    shown,
+)
 from mjx_drax.host import difference, integrate
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, State, evaluate, ranking
 from mjx_drax.linalg import exact
 from mjx_drax.precondition import GaussNewton
-from mjx_drax.problem import Cost, Problem, Stagewise, Trajectory, checked
-from mjx_drax.restarts import Restarts, run, unit_of
+from mjx_drax.problem import Cost, Problem, Stagewise, Trajectory, checked, numbers
+from mjx_drax.restarts import Restarts, as_restarts, run, unit_of
 from mjx_drax.scalar import pruned
 
 AHEAD = 8
@@ -164,40 +170,39 @@ class MPC:
         Raises:
             DraxError: a setting that cannot work, named with its value and the fix.
         """
-        explorers = chains // 2 if explorers is None and _whole(chains) else explorers
+        problem = checked(problem)
+        require_whole("chains", chains)
+        explorers = chains // 2 if explorers is None else explorers
         for name, count, least in (
-            ("chains", chains, 1),
             ("iterations", iterations, 1),
             ("every", every, 1),
             ("explorers", explorers, 0),
         ):
-            if not _whole(count) or count < least:  # type: ignore[operator]
-                raise DraxError(f"{name} is {count!r}: give a whole number of at least {least}.")
-        if explorers >= chains:  # type: ignore[operator]
+            require_whole(name, count, least)
+        if explorers >= chains:
             raise DraxError(
                 f"explorers is {explorers} of {chains} chains: leave at least one that does not."
             )
-        if not (isinstance(hold, float | int | np.number) and np.isfinite(hold) and hold >= 0):
-            raise DraxError(f"hold is {hold!r}: give a number of at least 0.")
+        require_not_negative("hold", hold)
         if any(end.ndim > 1 for end in jax.tree.leaves(problem.bounds)):
             raise DraxError(
                 f"bounds of {problem.name} differ from knot to knot, but the horizon recedes: "
                 "give the same ones for all, of shapes (nx,) and (nu,)."
             )
-        self.solver = solver or Restarts()
+        self.solver = Restarts() if solver is None else solver
+        self.original, self.problem = problem, holding(problem, hold)
+        as_restarts(self.problem, chains, seed, self.solver)
         if not isinstance(self.solver.flow.preconditioner, GaussNewton):
             raise DraxError(
                 f"preconditioner is {type(self.solver.flow.preconditioner).__name__}, which brings "
-                "no feedback gains: plans need GaussNewton()."
+                "no feedback gains: give GaussNewton()."
             )
         if iterations > self.solver.flow.tail:
             raise DraxError(
                 f"iterations is {iterations}, but the solver's tail has {self.solver.flow.tail}: "
                 "give fewer, or a longer tail."
             )
-        self.original, self.problem = problem, holding(problem, hold)
-        self.solver.check(self.problem)
-        self.chains, self.explorers = chains, int(explorers)  # type: ignore[arg-type]
+        self.chains, self.explorers = chains, int(explorers)
         self.iterations, self.every, self.seed = iterations, every, seed
         self.statistics = Statistics()
         self.first_solve = 0.0
@@ -225,9 +230,10 @@ class MPC:
         Everything that later plans need is compiled here too.
 
         Raises:
-            DraxError: x does not fit the problem.
+            DraxError: x does not fit the problem, or is not finite; nor is t.
         """
-        problem = checked(self.problem.with_x_init(np.asarray(x, float)))
+        problem = self.problem.with_x_init(x)
+        _require_time(t)
         clock = time.perf_counter()
         found = run(problem, self.chains, self.seed, self.solver, devices=1)
         unit = unit_of(np.asarray(found.records[0][1].cost))
@@ -251,6 +257,7 @@ class MPC:
         """Go back to the plan that the last `reset` made, at time t [s], without solving again."""
         if self._start is None:
             raise DraxError("there is nothing to go back to: call policy.reset(x) first.")
+        _require_time(t)
         self._carried, plan = self._start
         self._plan, self._time = replace(plan, time=t), t
         self.statistics = Statistics()
@@ -260,8 +267,13 @@ class MPC:
         """A plan from the state x (nx,) at time t [s], starting from the one in use.
 
         What is not finite is not used: the plan stays, and `statistics.failed` counts it.
+
+        Raises:
+            DraxError: there is no plan yet, x is no vector (nx,), or t is not finite.
         """
         self.latest  # noqa: B018 complains if there is none
+        x = self._state(x)
+        _require_time(t)
         by = max(0.0, (t - self._time) / float(self.problem.dynamics.dt))
         clock = time.perf_counter()
         plan = self._apply(self._carried, x, t, by)
@@ -275,11 +287,16 @@ class MPC:
         return self.latest
 
     def control(self, x: ArrayLike, t: float) -> np.ndarray:
-        """The control (nu,) at time t [s] for the state x (nx,), by the plan's feedback."""
+        """The control (nu,) at time t [s] for the state x (nx,), by the plan's feedback.
+
+        Raises:
+            DraxError: there is no plan yet, x is no vector (nx,), or t is not finite.
+        """
+        x = self._state(x)
+        _require_time(t)
         plan, K = self.latest, self.problem.horizon
         s = np.clip((t - plan.time) / float(self.problem.dynamics.dt), 0.0, K)
         k = int(min(s + 1e-6, K - 1))
-        x = np.asarray(x, float)
         if not np.isfinite(x).all():
             self.statistics.unmeasured += 1
             return np.clip(np.asarray(plan.u[k], float), self._lower, self._upper)
@@ -291,12 +308,13 @@ class MPC:
         """The control (nu,) at time t [s] for the state x (nx,), after a new plan if one is due."""
         if self._plan is None:
             self.reset(x, t)
-        elif self.due(t) and np.isfinite(np.asarray(x, float)).all():
+        elif self.due(t) and np.isfinite(self._state(x)).all():
             self.plan(x, t)
         return self.control(x, t)
 
     def due(self, t: float) -> bool:
         """Whether `every` control steps have passed since the plan in use was made."""
+        _require_time(t)
         steps = (t - self.latest.time) / float(self.problem.dynamics.dt)
         return steps > self.every - 1e-6
 
@@ -320,6 +338,17 @@ class MPC:
             self._plan = plan
         return plan
 
+    def _state(self, x: ArrayLike) -> np.ndarray:
+        """A state as it was measured, (nx,) numbers that need not be finite."""
+        nx = self.problem.dynamics.nx
+        try:
+            state = numbers(x)
+        except (TypeError, ValueError) as error:
+            raise DraxError(f"the state x is {shown(x)}: give {nx} numbers.") from error
+        if state.shape != (nx,):
+            raise DraxError(f"the state x has shape {state.shape}: give {nx} numbers, ({nx},).")
+        return state
+
     def _difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """x - y in the tangent space at y, (ndx,), on the host."""
         dynamics: Any = self.problem.dynamics
@@ -336,8 +365,9 @@ class MPC:
         return integrate(dynamics.mj_model, x, share * self._difference(np.asarray(y, float), x))
 
 
-def _whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+def _require_time(t: float) -> None:
+    if not is_number(t):
+        raise DraxError(f"the time t is {shown(t)}: give a finite number of seconds.")
 
 
 def holding(problem: Problem, hold: float) -> Problem:

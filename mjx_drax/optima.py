@@ -39,7 +39,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax.dynamics import Dynamics
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import require_positive
 from mjx_drax.langevin import FEASIBLE
 from mjx_drax.problem import Trajectory
 
@@ -91,8 +91,7 @@ def distinct(solution: Solution, tolerance: float = TOLERANCE) -> tuple[Optimum,
     Raises:
         DraxError: the tolerance is not a positive number.
     """
-    if not (isinstance(tolerance, float | int | np.number) and tolerance > 0):
-        raise DraxError(f"tolerance is {tolerance!r}: give a positive number, such as {TOLERANCE}.")
+    require_positive("tolerance", tolerance, f"a positive number, such as {TOLERANCE}")
     certified = np.flatnonzero(solution.certified_chains)
     if not certified.size:
         return ()

@@ -13,10 +13,10 @@ from itertools import pairwise
 import numpy as np
 
 from mjx_drax._mujoco import mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, is_number, require_not_negative, require_positive, shown
 from mjx_drax.host import Floats, integrate, set_state
 from mjx_drax.mjcf import index
-from mjx_drax.problem import Problem
+from mjx_drax.problem import Problem, numbers
 
 LASTS = 0.1
 """How long a push lasts [s], unless it says otherwise."""
@@ -73,11 +73,11 @@ class Plant:
         dynamics = problem.dynamics
         if not hasattr(dynamics, "mj_model"):
             raise DraxError(f"{problem.name} has no model to simulate: use from_mjcf.")
-        for name, value, least in (("noise", noise, 0.0), ("shaking", shaking, 0.0)):
-            if not (np.isfinite(value) and value >= least):
-                raise DraxError(f"{name} is {value!r}: give a number of at least {least:g}.")
-        if not (np.isfinite(mass) and mass > 0.0):
-            raise DraxError(f"mass is {mass!r}: give a positive factor, 1 for no error.")
+        require_not_negative("noise", noise)
+        require_not_negative("shaking", shaking)
+        require_positive("mass", mass, "a positive factor, 1 for no error")
+        for push in pushes:
+            _require_push(push)
         self.model: mujoco.MjModel = copy.copy(dynamics.mj_model)
         self.model.body_mass[:] *= mass
         self.model.body_inertia[:] *= mass
@@ -117,6 +117,21 @@ class Plant:
             root = self.shaking * np.sqrt(model.opt.timestep)
             data.qvel += root * self._random.standard_normal(model.nv)
         mujoco.mj_step(model, data)
+
+
+def _require_push(push: object) -> None:
+    if not isinstance(push, Push):
+        raise DraxError(f"a push is {shown(push)}: give a Push(time, body, force).")
+    try:
+        force = numbers(push.force)
+    except (TypeError, ValueError):
+        force = np.array(np.nan)
+    if force.shape != (3,) or not np.isfinite(force).all():
+        raise DraxError(f"the force of a push is {shown(push.force)}: give 3 finite numbers [N].")
+    if not is_number(push.time) or not is_number(push.lasts) or push.lasts < 0:
+        raise DraxError(
+            f"a push begins at {shown(push.time)} and lasts {shown(push.lasts)}: give seconds."
+        )
 
 
 def random_pushes(

@@ -66,7 +66,7 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
     if not has_phases(dynamics):
         raise DraxError(
             f"{solution.problem.name} has no model and {dynamics.nx} states: which of them are "
-            "velocities is unknown. Phase portraits need a model, or two states."
+            "velocities is unknown. Give one with a model, or with two states."
         )
     shown = coordinates(dynamics)[:PANELS]
     plan = np.asarray(solution.problem.with_start(solution.best), float)

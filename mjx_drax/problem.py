@@ -22,8 +22,18 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.derivatives import Differentiator, positive_part
 from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import (
+    DraxError,
+    reason,
+    require_positive,
+    require_whole,
+    shown,
+)
+from mjx_drax.functions import require_functions, require_shape, traced
 from mjx_drax.scalar import pruned
+
+MOST = 1_000_000
+"""Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
 CLOSE = 0.03
 """Smallest factor on the scatter of initial knots where f has kinks or states quaternions."""
@@ -124,7 +134,7 @@ class Cost:
             scalar = self.scalar
 
             def value(dz: Array) -> Array:
-                return scalar(*at(dz))
+                return jnp.asarray(scalar(*at(dz)), float)  # also a plain number
 
             slope, _ = by.jacobian(lambda dz: value(dz)[None], size, key)
             gradient = gradient + slope[0]
@@ -348,12 +358,13 @@ class Problem:
             reached = np.asarray(self.goal(self.dynamics.observe_replayed(x)))
         except Exception as error:
             raise DraxError(
-                f"goal failed at x = {x.tolist()}: {type(error).__name__}: {error}. It gets the "
-                "state of a function problem, or the mujoco.MjData of a model."
+                f"goal failed at x = {shown(x.tolist())}: {reason(error)}. Make it a function of "
+                "the state of a function problem, or of the mujoco.MjData of a model."
             ) from error
         if reached.size != 1 or reached.dtype.kind not in "biuf":
             raise DraxError(
-                f"goal returned shape {reached.shape}, {reached!r}: it must return one truth value."
+                f"goal returned shape {reached.shape}, {shown(reached)}: it must return one truth "
+                "value."
             )
         return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
 
@@ -369,23 +380,31 @@ def knots(horizon: float, dt: float) -> int:
         DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
     """
     for label, value in (("dt", dt), ("horizon", horizon)):
-        if not (isinstance(value, float | int | np.number) and np.isfinite(value) and value > 0):
-            raise DraxError(f"{label} is {value!r}: give a positive number of seconds.")
-    count = round(horizon / dt)
-    if count < 1:
+        require_positive(label, value, "a positive number of seconds")
+    share = float(horizon) / float(dt)
+    if share <= 0.5:
         raise DraxError(
             f"horizon is {horizon} s, shorter than one control step: give at least {dt:g} s."
         )
-    return count
+    if share >= MOST:
+        raise DraxError(
+            f"horizon is {horizon} s, which is {share:.3g} control steps of {dt:g} s: give less "
+            f"than {MOST:,} steps."
+        )
+    return round(share)
 
 
 def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:
     """(lower, upper) as given, or infinite for None."""
     if ends is None:
         return -np.inf, np.inf
-    if not isinstance(ends, tuple | list | np.ndarray) or len(ends) != 2:
-        raise DraxError(f"bounds of {label} are {ends!r}: give a pair (lower, upper).")
-    return ends[0], ends[1]
+    try:
+        lower, upper = ends
+    except (TypeError, ValueError) as error:
+        raise DraxError(
+            f"bounds of {label} are {shown(ends)}: give a pair (lower, upper)."
+        ) from error
+    return lower, upper
 
 
 def box(
@@ -401,11 +420,14 @@ def box(
 
     def end(value: ArrayLike, size: int, label: str) -> Array:
         try:
-            array = np.asarray(value, float)
+            array = numbers(value)
+            if np.isnan(array).any():
+                raise ValueError("NaN is no bound")
             return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
         except (TypeError, ValueError) as error:
             raise DraxError(
-                f"{label} is {value!r}: give numbers of shape ({size},), or one for all."
+                f"{label} is {shown(value)}: give numbers of shape ({size},), or one for all; -inf "
+                "and inf leave it free."
             ) from error
 
     (xl, xu), (ul, uu) = _pair("x", x), _pair("u", u)
@@ -437,7 +459,7 @@ def constraint_of(
         if function is None:
             sizes.append(0)
             continue
-        out = _traced(f"{label}{name}", function, arguments)
+        out = traced(f"{label}{name}", function, arguments)
         sizes.append(int(np.prod(out.shape)))
     parts = [None if f is None else as_partial(f) for f in (equality, inequality)]
     return Constraint(parts[0], parts[1], sizes[0], sizes[1])
@@ -509,8 +531,29 @@ def from_function(
         name: used in files and tables.
 
     Raises:
-        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one.
+        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one; a function
+            that computes something else when it is traced again.
     """
+    require_functions(
+        f=f,
+        running_cost=running_cost,
+        terminal_cost=terminal_cost,
+        running_residual=running_residual,
+        terminal_residual=terminal_residual,
+        equality=equality,
+        inequality=inequality,
+        terminal_equality=terminal_equality,
+        terminal_inequality=terminal_inequality,
+        goal=goal,
+        guess=guess,
+    )
+    if f is None:
+        raise DraxError("f is None: give the dynamics, a function f(x, u) -> x_next.")
+    require_whole("nu", nu)
+    if nu > MOST:
+        raise DraxError(f"nu is {nu}, the size of a control: give at most {MOST:,}.")
+    require_name(name)
+    K = knots(horizon, dt)
     x_init = vector("x_init", x_init)
     nx = x_init.shape[0]
     bounds = box(nx, nu, x_bounds, u_bounds)
@@ -529,20 +572,52 @@ def from_function(
             bounds=bounds,
             scatter=scatter_box(bounds, x_init, jnp.ones(nx), x_scatter, u_scatter),
             aside=Aside(goal, guess, name),
-            horizon=knots(horizon, dt),
+            horizon=K,
         )
     )
 
 
+def require_name(name: object) -> None:
+    """Complain about a name that is no text.
+
+    Raises:
+        DraxError: naming its value.
+    """
+    if not isinstance(name, str) or not name:
+        raise DraxError(f"name is {shown(name)}: give a text.")
+
+
+def numbers(value: ArrayLike) -> np.ndarray:
+    """Real numbers as float64.
+
+    Raises:
+        TypeError, ValueError: they are none, or lists of different lengths.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind in "USc":  # strings would be parsed, imaginary parts dropped
+        raise TypeError(f"{array.dtype} holds no real numbers")
+    try:
+        return np.asarray(array, float)
+    except OverflowError as error:  # of Python's own whole numbers
+        raise ValueError(str(error)) from error
+
+
 def vector(label: str, value: ArrayLike) -> Array:
     """A finite float vector (n,), or a DraxError that says what was given."""
+    if isinstance(value, jax.core.Tracer):
+        raise DraxError(
+            f"{label} is traced, so its numbers cannot be checked: use "
+            f"dataclasses.replace(problem, {label}=...) inside of JAX functions."
+        )
     try:
-        array = np.asarray(value, float)
+        array = numbers(value)
     except (TypeError, ValueError) as error:
-        raise DraxError(f"{label} is {value!r}: give a vector of numbers.") from error
-    if array.ndim != 1 or not np.all(np.isfinite(array)):
-        raise DraxError(f"{label} is {value!r}: give a vector of finite numbers.")
-    return jnp.asarray(array)
+        raise DraxError(f"{label} is {shown(value)}: give a vector of numbers.") from error
+    with np.errstate(over="ignore"):  # a number that float32 cannot hold becomes infinite
+        out = jnp.asarray(array)
+    if array.ndim != 1 or not np.isfinite(out).all():
+        raise DraxError(f"{label} is {shown(value)}: give a vector of finite numbers.")
+    return out
 
 
 def scatter_box(
@@ -583,93 +658,114 @@ def checked(problem: Problem) -> Problem:
     Raises:
         DraxError: naming the cause, the value seen and the fix.
     """
-    dynamics, bounds = problem.dynamics, problem.bounds
+    if not isinstance(problem, Problem):
+        raise DraxError(
+            f"the problem is {shown(problem)}: give one from from_mjcf or from_function."
+        )
+    dynamics, name = problem.dynamics, problem.name
     nx, nu = dynamics.nx, dynamics.nu
     if nu < 1:
-        raise DraxError(f"{problem.name} has {nu} controls: a problem needs at least one actuator.")
-    if problem.x_init.shape != (nx,):
+        raise DraxError(f"{name} has {nu} controls: a problem needs at least one; add an actuator.")
+    require_whole("the number of knots, horizon,", problem.horizon)
+    start = np.asarray(problem.x_init)
+    if start.dtype.kind != "f" or not np.isfinite(start).all():
+        raise DraxError(f"x_init is {shown(start)}: give a vector of finite floats.")
+    if start.shape != (nx,):
         raise DraxError(
-            f"x_init has shape {problem.x_init.shape}, the dynamics have states of shape ({nx},)."
+            f"x_init has shape {start.shape}: give {nx} numbers, the states of the dynamics."
         )
-    for label, lower, upper in (
-        ("x", bounds.x_lower, bounds.x_upper),
-        ("u", bounds.u_lower, bounds.u_upper),
-        ("scatter of x", problem.scatter.x_lower, problem.scatter.x_upper),
-        ("scatter of u", problem.scatter.u_lower, problem.scatter.u_upper),
-    ):
-        size = nx if label.endswith("x") else nu
-        for end in (lower, upper):
-            if end.shape not in ((size,), (problem.horizon, size)):
-                raise DraxError(
-                    f"bounds of {label} have shape {end.shape}: give numbers of shape ({size},), "
-                    f"or ({problem.horizon}, {size}) for each knot."
-                )
-        crossed = np.argwhere(~(np.asarray(lower) <= np.asarray(upper)))
-        if crossed.size:
-            i = tuple(int(j) for j in crossed[0])
-            raise DraxError(
-                f"bounds of {label} cross at element {i[-1]}: lower {float(lower[i])}, "
-                f"upper {float(upper[i])}. Give lower <= upper."
-            )
-    below, above = bounds.x_lower - problem.x_init, problem.x_init - bounds.x_upper
-    outside = float(jnp.maximum(below, above).max(initial=0.0))
-    if bounds.x_lower.ndim == bounds.x_upper.ndim == 1 and outside > 1e-6:
-        raise DraxError(
-            f"x_init = {np.asarray(problem.x_init).tolist()} lies outside the bounds of x by "
-            f"{outside:.3g}: move it inside, or widen the bounds."
-        )
-    if all(
-        part is None
-        for cost in (problem.running, problem.terminal)
-        for part in (cost.scalar, cost.residual)
-    ):
-        raise DraxError(f"{problem.name} has no cost: give a running or a terminal one.")
-    u = jax.ShapeDtypeStruct((nu,), problem.x_init.dtype)
-    x = jax.ShapeDtypeStruct((nx,), problem.x_init.dtype)
-    _check_shape("the dynamics f(x, u)", dynamics.step, (x, u), (nx,))
-    observed = jax.eval_shape(dynamics.observe, x, u)
-    for label, part, arguments in (
-        ("running_cost", problem.running.scalar, (observed, u)),
-        ("terminal_cost", problem.terminal.scalar, (observed,)),
-    ):
-        if part is not None:
-            _check_shape(label, part, arguments, ())
-    for label, part, arguments in (
-        ("running_residual", problem.running.residual, (observed, u)),
-        ("terminal_residual", problem.terminal.residual, (observed,)),
-    ):
-        if part is not None:
-            _check_shape(label, part, arguments, None)
+    _check_bounds(problem, start)
+    costs = (problem.running, problem.terminal)
+    if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
+        raise DraxError(f"{name} has no cost: give a running or a terminal one.")
+    for label, function, arguments, shape in functions_of(problem):
+        if function != dynamics.step or not hasattr(dynamics, "mj_model"):  # MJX's takes a second
+            require_shape(label, function, arguments, shape)
+    _check_guess(problem)
     problem.reached(np.asarray(problem.x_init, float))
     return problem
 
 
-def _check_shape(
-    label: str,
-    function: Callable[..., Any],
-    arguments: tuple[Any, ...],
-    shape: tuple[int, ...] | None,
-) -> None:
-    """Trace a user's function abstractly; complain if it fails or returns another shape."""
-    seen = _traced(label, function, arguments).shape
-    if shape is not None and seen != shape:
-        expected = "a scalar" if shape == () else f"shape {shape}"
-        hint = " (a vector cost goes in as a residual)" if shape == () else ""
-        raise DraxError(f"{label} returned shape {seen}, but must return {expected}{hint}.")
+def _check_bounds(problem: Problem, start: np.ndarray) -> None:
+    """The part of `checked` for bounds, the box of initial knots, and x_init (nx,) in them."""
+    dynamics, bounds, scatter = problem.dynamics, problem.bounds, problem.scatter
+    for label, size, ends in (
+        ("x", dynamics.nx, (bounds.x_lower, bounds.x_upper)),
+        ("u", dynamics.nu, (bounds.u_lower, bounds.u_upper)),
+        ("scatter of x", dynamics.nx, (scatter.x_lower, scatter.x_upper)),
+        ("scatter of u", dynamics.nu, (scatter.u_lower, scatter.u_upper)),
+    ):
+        for end in ends:
+            if np.shape(end) not in ((size,), (problem.horizon, size)):
+                raise DraxError(
+                    f"bounds of {label} have shape {np.shape(end)}: give numbers of shape "
+                    f"({size},), or ({problem.horizon}, {size}) for each knot."
+                )
+        lower, upper = np.broadcast_arrays(*map(np.asarray, ends))
+        for wrong, words in (
+            (np.isnan(lower) | np.isnan(upper), "hold NaN"),
+            (lower > upper, "cross"),
+            ((lower == np.inf) | (upper == -np.inf), "leave nothing in between"),
+        ):
+            if wrong.any():
+                at = tuple(int(i) for i in np.argwhere(wrong)[0])
+                raise DraxError(
+                    f"bounds of {label} {words} at element {at[-1]}: lower {float(lower[at])}, "
+                    f"upper {float(upper[at])}. Give lower <= upper, -inf and inf if free."
+                )
+    if bounds.x_lower.ndim == bounds.x_upper.ndim == 1:
+        low, high = np.asarray(bounds.x_lower), np.asarray(bounds.x_upper)
+        outside = np.maximum(low - start, start - high).max(initial=0.0)
+        if outside > 1e-6:
+            raise DraxError(
+                f"x_init = {shown(start.tolist())} lies outside the bounds of x by {outside:.3g}: "
+                "move it inside, or widen the bounds."
+            )
 
 
-def _traced(label: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """Shape and dtype of what a user's function returns, which must be one array of floats."""
+def functions_of(
+    problem: Problem,
+) -> list[tuple[str, Callable[..., Any], tuple[Any, ...], tuple[int, ...] | None]]:
+    """The functions of a problem: label, function, what it is called with, and shape if known.
+
+    What it is called with has shapes and no values.
+    """
+    dynamics, dtype = problem.dynamics, problem.x_init.dtype
+    x, u = (jax.ShapeDtypeStruct((size,), dtype) for size in (dynamics.nx, dynamics.nu))
+    found: list[Any] = [("the dynamics f(x, u)", dynamics.step, (x, u), (dynamics.nx,))]
+    seen = jax.eval_shape(dynamics.observe, x, u)
+    for when, cost, constraint, arguments in (
+        ("running", problem.running, problem.constraint, (seen, u)),
+        ("terminal", problem.terminal, problem.terminal_constraint, (seen,)),
+    ):
+        before = "" if when == "running" else "terminal_"
+        of_cost = f"{when}_" if dynamics.nx else ""  # a program has but one
+        found += [
+            (f"{of_cost}cost", cost.scalar, arguments, ()),
+            (f"{of_cost}residual", cost.residual, arguments, None),
+            (f"{before}equality", constraint.equality, arguments, None),
+            (f"{before}inequality", constraint.inequality, arguments, None),
+        ]
+    return [entry for entry in found if entry[1] is not None]
+
+
+def _check_guess(problem: Problem) -> None:
+    """The part of `checked` for the function that draws initial knots."""
+    if problem.guess is None:
+        return
+    K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
+    wanted = f"a Trajectory with x ({K}, {nx}) and u ({K}, {nu})"
     try:
-        out = jax.eval_shape(function, *arguments)
-    except DraxError:
-        raise
+        knots = jax.eval_shape(problem.guess, jax.random.key(0))
     except Exception as error:
-        reason = str(error).strip().split("\n")[0] or type(error).__name__
         raise DraxError(
-            f"{label} failed when it was traced: {type(error).__name__}: {reason}. It must be a "
-            "JAX function of its arguments (jax.numpy, no Python branches on values)."
+            f"guess failed when it was traced: {reason(error)}. Make it a JAX function of a random "
+            f"key that returns {wanted}."
         ) from error
-    if getattr(out, "shape", None) is None or not jnp.issubdtype(out.dtype, jnp.floating):
-        raise DraxError(f"{label} returned {out}: it must return one array of floats.")
-    return out
+    if not isinstance(knots, Trajectory):
+        raise DraxError(f"guess returned a {type(knots).__name__}: return {wanted}.")
+    shapes = [getattr(part, "shape", None) for part in (knots.x, knots.u)]
+    if shapes != [(K, nx), (K, nu)]:
+        raise DraxError(
+            f"guess returned x of shape {shapes[0]} and u of shape {shapes[1]}: return {wanted}."
+        )

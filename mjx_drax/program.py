@@ -18,9 +18,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_whole, shown
+from mjx_drax.functions import require_functions
 from mjx_drax.langevin import FEASIBLE, Langevin
-from mjx_drax.problem import Problem, Trajectory, from_function
+from mjx_drax.problem import Problem, Trajectory, checked, from_function, numbers
 from mjx_drax.restarts import Progress, Restarts, run
 
 
@@ -50,6 +51,8 @@ def from_program(
     Raises:
         DraxError: functions, sizes or bounds that do not fit.
     """
+    require_functions(cost=cost, residual=residual, equality=equality, inequality=inequality)
+    require_whole("size", size)
 
     def of_control(function: Callable[[Array], Array] | None) -> Callable[..., Any] | None:
         return None if function is None else lambda x, u: function(u)
@@ -115,14 +118,19 @@ def minimize(
     """Solve a program from `from_program`; `guess` (n,) or (chains, n) replaces random points.
 
     Raises:
-        DraxError: sizes that misfit, or a cost that is not finite at any initial point.
+        DraxError: sizes that misfit; functions that cannot be differentiated, or are finite, with
+            their derivatives, at no initial point.
     """
+    program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
     knots = None
     if guess is not None:
         size = program.dynamics.nu
-        given = np.asarray(guess, float)
+        try:
+            given = numbers(guess)
+        except (TypeError, ValueError) as error:
+            raise DraxError(f"guess is {shown(guess)}: give numbers, ({size},).") from error
         if given.shape not in ((size,), (chains, size)):
             raise DraxError(
                 f"guess has shape {given.shape}: give ({size},), or ({chains}, {size}) with one "
@@ -130,7 +138,7 @@ def minimize(
             )
         u = jnp.asarray(given)[..., None, :]
         knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
-    result = run(program, chains, seed, solver or Restarts(), knots, progress)
+    result = run(program, chains, seed, Restarts() if solver is None else solver, knots, progress)
     info, rows = result.info, program.constraint.equalities
     multipliers = np.asarray(result.state.multipliers.constraints.stage[:, 0])
     return Minimum(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import require_whole
 from mjx_drax.langevin import Info, Langevin, ranking
 from mjx_drax.linalg import exact
 from mjx_drax.problem import Problem, Trajectory
@@ -137,8 +137,7 @@ class Recorder:
     """
 
     def __init__(self, every: int) -> None:
-        if not isinstance(every, int | np.integer) or every < 1:
-            raise DraxError(f"record is {every!r}: give a whole number of iterations, at least 1.")
+        require_whole("record", every)
         self.every = int(every)
         self.attempts: list[Tries] = []
 

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from mjx_drax import movie
 from mjx_drax._mujoco import APT_EGL, mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_positive, shown
 from mjx_drax.host import finite, interpolated
 from mjx_drax.movie import Frame
 
@@ -226,7 +226,7 @@ def _frames(
     positions, instants = _checked_motion(model, qpos, times)
     at = frame_times(instants, fps, speed)
     if isinstance(overlay, str):
-        raise DraxError(f"overlay is a sequence of lines, not one string: [{overlay!r}]")
+        raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
     height, width = movie.even(size)
     view = view_of(model, positions, camera, width / height)
 
@@ -280,9 +280,8 @@ def _drawn_frames(
 
 def frame_times(times: Floats, fps: float, speed: float = 1.0) -> Floats:
     """When frames are taken of a motion between times (T,) [s]: its end is held."""
-    for name, value in (("fps", fps), ("speed", speed)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise DraxError(f"{name} must be positive, not {value}")
+    require_positive("fps", fps)
+    require_positive("speed", speed)
     step = speed / fps
     count = int((times[-1] - times[0]) / step + 1e-6) + 1
     at = times[0] + np.arange(count) * step
@@ -329,9 +328,11 @@ def view_of(
     if wanted == FREE and FREE not in names:
         return _framing_camera(model, qpos, aspect)
     index = names.index(wanted) if wanted in names else wanted
-    if isinstance(index, str) or not 0 <= index < model.ncam:
+    if not isinstance(index, int | np.integer) or not 0 <= index < model.ncam:
         known = ", ".join(name or f"{i} (unnamed)" for i, name in enumerate(names)) or "none"
-        raise DraxError(f"no camera {wanted!r} in this model: use {FREE!r}, or of its own: {known}")
+        raise DraxError(
+            f"no camera {shown(wanted)} in this model: use {FREE!r}, or of its own: {known}"
+        )
     view = mujoco.MjvCamera()
     view.type = mujoco.mjtCamera.mjCAMERA_FIXED
     view.fixedcamid = index

@@ -36,7 +36,8 @@ from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
 from mjx_drax.devices import SPLIT, divided, mesh_for, spread
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, require_not_negative, require_whole, shown
+from mjx_drax.functions import require_functions
 from mjx_drax.langevin import (
     DAMPING,
     EASE,
@@ -50,7 +51,7 @@ from mjx_drax.langevin import (
     evaluate,
     ranking,
 )
-from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.problem import Problem, Trajectory, functions_of, numbers
 from mjx_drax.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.schedules import Geometric
 
@@ -130,16 +131,13 @@ class Restarts:
             DraxError: naming the setting, its value and the fix.
         """
         if not isinstance(self.flow, Langevin):
-            raise DraxError(f"flow is {self.flow!r}: give a Langevin.")
+            raise DraxError(f"flow is {shown(self.flow)}: give a Langevin.")
         self.flow.check(problem)
-        descent = 0 if self.descent is None else self.descent
-        for name, count, least in (("descent", descent, 0), ("attempts", self.attempts, 1)):
-            if not isinstance(count, int | np.integer) or count < least:
-                raise DraxError(f"{name} is {count!r}: give a whole number of at least {least}.")
+        if self.descent is not None:
+            require_whole("descent", self.descent, 0)
+        require_whole("attempts", self.attempts)
         for name in ("within", "enough"):
-            value = getattr(self, name)
-            if not (isinstance(value, float | int | np.number) and value >= 0):
-                raise DraxError(f"{name} is {value!r}: give a number of at least 0.")
+            require_not_negative(name, getattr(self, name))
 
 
 def with_iterations(solver: Langevin | Restarts, iterations: int) -> Langevin | Restarts:
@@ -237,6 +235,7 @@ def run(
     checkpoint: Checkpoint | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments."""
+    require_functions(progress=progress)
     solver = as_restarts(problem, chains, seed, solver)
     mesh = mesh_for(chains, devices)
     search = _Search(problem, chains, seed, guess, progress, recorder, mesh, checkpoint)
@@ -249,12 +248,12 @@ def as_restarts(problem: Problem, chains: int, seed: int, solver: Langevin | Res
     Raises:
         DraxError: a number of chains, seed or setting that cannot work.
     """
-    if not isinstance(chains, int | np.integer) or chains < 1:
-        raise DraxError(f"chains is {chains!r}: give a whole number of at least 1.")
-    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
+    require_whole("chains", chains)
+    require_whole("seed", seed, 0)
+    if seed >= 2**32:
         raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
     if not isinstance(solver, Langevin | Restarts):
-        raise DraxError(f"solver is {solver!r}: give a Langevin or a Restarts.")
+        raise DraxError(f"solver is {shown(solver)}: give a Langevin or a Restarts.")
     solver.check(problem)
     if isinstance(solver, Langevin):
         return Restarts(solver, descent=None, attempts=1)
@@ -290,7 +289,7 @@ class _Search:
         if self.checkpoint is not None:
             self._require(self.checkpoint, solver, flow)
         state, info = self._start(flow, 0)
-        _require_finite(self.problem, info)
+        _require_finite(flow, self.problem, state, info)
         unit, everyone = unit_of(np.asarray(info.cost)), np.arange(self.chains)
         at, damping = Attempt(state, info, np.full(self.chains, -1)), np.ones(self.chains)
         self.stand = Stand(0, unit, everyone, None, at, damping, ((0, info),))
@@ -425,6 +424,8 @@ class _Search:
         key = jax.random.key(self.seed)
         key_knots, key_noise = jax.random.split(jax.random.fold_in(key, attempt))
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
+        if attempt == 0 and not hasattr(self.problem.dynamics, "mj_model"):
+            _require_sound(flow, self.problem, knots)  # takes long for models: when they fail
         return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
 
     def _mended(self, flow: Langevin, expected: int) -> bool:
@@ -517,6 +518,8 @@ class _Search:
                 stop = min(stand.step + self._stride(total), total)
                 ahead = self._advanced(flow, at.state, stand.step, stop, tail)
                 state, info = jax.block_until_ready(ahead)
+                if before == 0 and (np.asarray(state.died_at) == 0).all():
+                    _require_sound(flow, self.problem, at.state.trajectory)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(at.converged_at < 0, before + stop, at.converged_at)
                 at = Attempt(state, info, np.where(feasible, since, -1))
@@ -653,9 +656,17 @@ def initial_knots(
             return jax.vmap(problem.draw)(keys)
         return _draw(problem, keys)
     K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
+    if not isinstance(guess, Trajectory):
+        raise DraxError(f"guess is {shown(guess)}: give a Trajectory(x, u), or see guesses.")
     knots = []
     for label, value, size in (("x", guess.x, nx), ("u", guess.u, nu)):
-        array = np.asarray(value, problem.x_init.dtype)
+        try:
+            with np.errstate(over="ignore"):  # what float32 cannot hold is refused as infinite
+                array = np.asarray(numbers(value), problem.x_init.dtype)
+        except (TypeError, ValueError) as error:
+            raise DraxError(
+                f"guess.{label} is {shown(value)}: give numbers of shape ({K}, {size})."
+            ) from error
         if array.shape not in ((K, size), (chains, K, size)):
             raise DraxError(
                 f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
@@ -670,12 +681,83 @@ def initial_knots(
 _draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))
 
 
-def _require_finite(problem: Problem, info: Info) -> None:
+def _require_finite(flow: Langevin, problem: Problem, state: State, info: Info) -> None:
     """Complain if no chain could possibly start."""
     for label, values in (("cost", info.cost), ("dynamics", info.max_defect)):
         if not np.isfinite(values).any():
+            _require_sound(flow, problem, state.trajectory)
             raise DraxError(
                 f"the {label} of {problem.name} is {float(values[0])} at the initial knots of "
                 f"every chain ({len(values)} tried): make it finite there (no 0/0, no log or sqrt "
                 "of negative numbers), or narrow the scatter of the initial knots."
             )
+
+
+def _require_sound(flow: Langevin, problem: Problem, knots: Trajectory) -> None:
+    """Complain about a function that is finite, with its derivatives, for no chain's knots.
+
+    Those of a stage are tried at x_init, where every chain stays, and its first control; those of
+    the end at its last state.
+
+    Raises:
+        DraxError: naming the function, where it fails and the fix.
+    """
+    flow = replace(flow, scale=Scale())  # of one type, measured or not
+    finite = _soundness(flow, problem, knots, flow.forward(problem))
+    for label, *_ in functions_of(problem):
+        for what, good in zip(
+            ("value", "derivative", "second derivative"), finite[label], strict=False
+        ):
+            if not np.asarray(good).any():
+                at = "the initial points"
+                if problem.dynamics.nx:
+                    at = "the last initial state" if label.startswith("terminal") else "x_init"
+                raise DraxError(
+                    f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
+                    "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
+                    "move x_init or the scatter of initial knots."
+                )
+
+
+@partial(jax.jit, static_argnames="exact")
+def _soundness(
+    flow: Langevin, problem: Problem, knots: Trajectory, exact: bool
+) -> dict[str, list[Array]]:
+    """Whether functions, first and second derivatives are finite, (chains,) each.
+
+    Derivatives are taken in one direction that moves every number.
+    """
+    inside = jax.vmap(partial(flow.bounds.interior, problem.bounds))(replace(knots, slack=None))
+    u = inside.u[:, 0]
+    start = jnp.broadcast_to(problem.x_init, (len(u), problem.dynamics.nx))
+    found = {}
+    for label, function, arguments, _ in functions_of(problem):
+        orders = [_of_knot(problem, function, len(arguments) == 1)]
+        if exact:
+            orders.append(_slope(orders[0]))
+            orders.append(_slope(orders[1]) if label.endswith("cost") else orders[1])
+        z = jnp.concatenate([inside.x[:, -1] if len(arguments) == 1 else start, u], axis=1)
+        found[label] = [jax.vmap(lambda z, f=f: jnp.isfinite(f(z)).all())(z) for f in orders]
+    return found
+
+
+def _of_knot(
+    problem: Problem, function: Callable[..., Any], at_end: bool
+) -> Callable[[Array], Array]:
+    """A function of a problem as one of z = [x, u]."""
+    dynamics = problem.dynamics
+
+    def value(z: Array) -> Array:
+        x, u = jnp.split(z, [dynamics.nx])
+        if function == dynamics.step:
+            return dynamics.step(x, u)
+        if at_end:
+            return jnp.asarray(function(dynamics.observe(x, jnp.zeros_like(u))), float)
+        return jnp.asarray(function(dynamics.observe(x, u), u), float)
+
+    return value
+
+
+def _slope(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """The derivative along (1, ..., 1)."""
+    return lambda z: jax.jvp(function, (z,), (jnp.ones_like(z),))[1]

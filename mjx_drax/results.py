@@ -20,7 +20,7 @@ import numpy as np
 
 from mjx_drax.checkpoint import versions
 from mjx_drax.errors import DraxError
-from mjx_drax.files import complete, require_room
+from mjx_drax.files import complete, file_path, require_room
 from mjx_drax.mjcf import MjxDynamics
 from mjx_drax.optima import Optimum
 from mjx_drax.problem import Problem, Trajectory
@@ -174,8 +174,8 @@ def _flat(label: str, part: Any) -> Iterator[tuple[str, np.ndarray]]:
 def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
     """Write result.json and result.npz into a folder, each at once or not at all.
 
-    `Solution.load` reads them again. result.json knows the digest of the result.npz that belongs to
-    it.
+    `Solution.load` reads them again. result.json knows its own digest, and that of the result.npz
+    that belongs to it.
 
     Raises:
         DraxError: the folder cannot be written to.
@@ -185,9 +185,16 @@ def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
         np.savez_compressed(partial, **arrays(solution))  # type: ignore[arg-type]
         digest = hashlib.sha256(partial.read_bytes()).hexdigest()
     with complete(folder / SUMMARY) as partial:
-        text = json.dumps({**summary(solution), "npz_sha256": digest}, indent=2)
+        whole = {**summary(solution), "npz_sha256": digest}
+        text = json.dumps({**whole, "json_sha256": json_digest(whole)}, indent=2)
         partial.write_text(text + "\n", encoding="utf-8")
     return folder
+
+
+def json_digest(summary: dict[str, Any]) -> str:
+    """The digest of what `result.json` says, however it is laid out."""
+    said = {name: value for name, value in summary.items() if name != "json_sha256"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def writable(folder: str | os.PathLike[str], size: int = 1) -> Path:
@@ -196,7 +203,7 @@ def writable(folder: str | os.PathLike[str], size: int = 1) -> Path:
     Raises:
         DraxError: it cannot be made or written to, or the disk is too full.
     """
-    path = Path(folder).expanduser()
+    path = file_path(folder)
     try:
         require_room(path / ARRAYS, size)
     except DraxError as error:

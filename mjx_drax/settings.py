@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_drax.bounds import LogBarrier, Projection, Reflection
 from mjx_drax.derivatives import Autodiff, Smoothed
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, shown
 from mjx_drax.langevin import Langevin, Scale
 from mjx_drax.precondition import Diagonal, GaussNewton, Identity
 from mjx_drax.quasi_newton import LBFGS
@@ -84,7 +84,8 @@ def from_data(data: Any) -> Any:
         return part(**{name: from_data(value) for name, value in data.items() if name != "part"})
     except (KeyError, TypeError) as error:
         raise DraxError(
-            f"settings {data} cannot be read: {error}. Another version of mjx_drax wrote them."
+            f"settings {shown(data)} cannot be read: {error}. Another version of mjx_drax wrote "
+            "them: use that one, or solve again."
         ) from error
 
 

@@ -310,13 +310,14 @@ def solve(
         the solution with its certificate; look at `solution.certified`.
 
     Raises:
-        DraxError: sizes that misfit; a cost or dynamics that are not finite at any initial knot; a
-            checkpoint that cannot be written, is damaged or belongs to another solve.
+        DraxError: sizes that misfit; functions that cannot be differentiated, compute something
+            else each time, or are finite, with their derivatives, at no initial knot; a checkpoint
+            that cannot be written, is damaged or belongs to another solve.
     """
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
-    solver = solver or Restarts()
+    solver = Restarts() if solver is None else solver
     recorder = None if record is None else Recorder(record)
     file = None if checkpoint is None else Checkpoint(checkpoint)
     found = run(problem, chains, seed, solver, guess, progress, recorder, devices, file)

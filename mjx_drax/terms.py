@@ -26,8 +26,9 @@ from mjx_drax import quaternion
 from mjx_drax._mujoco import mujoco
 from mjx_drax.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.dynamics import Static, as_partial
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, shown
 from mjx_drax.mjcf import index, load
+from mjx_drax.problem import numbers as real_numbers
 
 Names = str | Iterable[str]
 
@@ -272,7 +273,8 @@ class Terms:
         return parts[0] if len(parts) == 1 else parts[0] + parts[1]
 
     def _indices(self, kind: str, names: Names) -> list[int]:
-        found = [index(self.model, kind, n) for n in ([names] if isinstance(names, str) else names)]
+        listed = [names] if isinstance(names, str) or not isinstance(names, Iterable) else names
+        found = [index(self.model, kind, name) for name in listed]
         if not found:
             raise DraxError(f"no {kind} is named: give at least one name.")
         return found
@@ -337,13 +339,13 @@ def _clearance(
 def _numbers(label: str, value: Any, size: int, alike: bool = False) -> np.ndarray:
     """Finite numbers (size,); one number stands for all if there is one, or if they are alike."""
     try:
-        array = np.asarray(value, float)
+        array = real_numbers(value)
     except (TypeError, ValueError) as error:
-        raise DraxError(f"{label} is {value!r}: give {size} number(s).") from error
+        raise DraxError(f"{label} is {shown(value)}: give {size} number(s).") from error
     one = array.ndim == 0 and (alike or size == 1)
     if (not one and array.shape != (size,)) or not np.isfinite(array).all():
         give = f"one number, or {size}" if alike and size != 1 else f"{size} number(s)"
-        raise DraxError(f"{label} is {value!r}: give {give}, all finite.")
+        raise DraxError(f"{label} is {shown(value)}: give {give}, all finite.")
     return np.broadcast_to(array, (size,))
 
 
@@ -361,7 +363,7 @@ def _quaternion(label: str, value: Any) -> np.ndarray:
     matrix = _numbers(label, np.ravel(value), 9).reshape(3, 3)
     if np.abs(matrix.T @ matrix - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
         raise DraxError(
-            f"{label} is {matrix.tolist()}: give a rotation matrix, R'R = I, det R = 1."
+            f"{label} is {shown(matrix.tolist())}: give a rotation matrix, R'R = I, det R = 1."
         )
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, matrix.ravel())
@@ -371,7 +373,9 @@ def _quaternion(label: str, value: Any) -> np.ndarray:
 def _weights(label: str, size: int, weight: ArrayLike) -> np.ndarray:
     weights = _numbers(f"weight of {label}", weight, size, alike=True)
     if (weights < 0).any():
-        raise DraxError(f"weight of {label} is {weight!r}: give numbers that are not negative.")
+        raise DraxError(
+            f"weight of {label} is {shown(weight)}: give numbers that are not negative."
+        )
     return weights
 
 

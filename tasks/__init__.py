@@ -32,7 +32,7 @@ def load(name: str) -> ModuleType:
     Raises:
         DraxError: there is no such task; lists those there are.
     """
-    matching = [task for task in names() if task.startswith(name)]
+    matching = [task for task in names() if task.startswith(str(name))]
     if name in matching:
         matching = [name]
     if len(matching) != 1:

@@ -339,7 +339,7 @@ def branches(data, *u):
         ({"x_init": "down"}, "x_init is 'down'"),
         ({"x_bounds": (0.3, 1.0)}, "bounds of x cross at element 0: lower 0.3.*, upper 0.25"),
         ({"u_bounds": (-1, [1, -2])}, "bounds of u cross at element 1: lower -1.0, upper -2.0"),
-        ({"u_bounds": (np.nan, 1.0)}, "bounds of u cross at element 0: lower nan"),
+        ({"u_bounds": (np.nan, 1.0)}, "lower end of u is nan: give numbers"),
         ({"x_bounds": ([0, 0], 1.0)}, r"lower end of x .*shape \(5,\)"),
         ({"u_scatter": (1.0, -1.0)}, "scatter of u cross at element 0"),
         ({"terminal_cost": pose}, r"terminal_cost returned shape \(2,\).*scalar.*residual"),
