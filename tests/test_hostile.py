@@ -732,7 +732,7 @@ BATCHES = [
     ("make-raises", lambda at: family(fails), "make failed for value 0", "no such sensor"),
     ("make-returns-none", lambda at: family(lambda x: None), "the problem is None"),
     ("make-constant", lambda at: family(lambda x: at.point), "same problem for every value"),
-    ("make-checks-traced", lambda at: family(at.point.with_x_init), "x_init is traced", "replace"),
+    ("make-checks-traced", lambda at: family(at.point.with_x_init), "when it was traced", "replace"),
     ("make-branches", lambda at: family(lambda x: moved(x if x[0] > 0 else -x)),
      "make failed when it was traced"),
     ("make-other-model", lambda at: family(lambda g: robot(arm(option=f'gravity="0 0 {g[0]}"'))),
