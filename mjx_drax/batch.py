@@ -264,7 +264,7 @@ def solve_batch(
     solver: Langevin | Restarts | None = None,
     chunk: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    devices: int | None = None,
+    devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
@@ -280,7 +280,7 @@ def solve_batch(
         solver: `Restarts()` by default.
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
         progress: called with (problems done, of how many) after every chunk.
-        devices: how many to spread a chunk over; by default as many of this host's as divide it.
+        devices: how many of this process to spread a chunk over, evenly; see `solve`.
         checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
             there, as in `solve`.
 

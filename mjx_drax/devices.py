@@ -1,4 +1,8 @@
-"""Chains, or problems, spread over the devices of this host; each works on its own share.
+"""Chains, or problems, spread over processes and their devices; each works on its own share.
+
+Several processes, maybe on several hosts, are what `jax.distributed.initialize` makes of them. All
+run the same program with the same arguments. Each does the iterations of its share, and then they
+exchange what they found, so that everything else goes on in each of them as in one alone.
 
 Chains exchange nothing and each has its own random key, so answers do not depend on the shares: two
 devices and four were seen to give the same, bit for bit. One device and several agree but for
@@ -24,12 +28,12 @@ from mjx_drax.errors import DraxError
 SPLIT = P("share")
 
 
-def mesh_for(count: int, devices: int | None) -> Mesh | None:
+def mesh_for(count: int, devices: int = 1) -> Mesh | None:
     """The devices that a process spreads its share of `count` chains over, or None for one.
 
     Args:
         count: chains, or problems, of all processes.
-        devices: how many to use, of each process; None: as many as there are that divide its share.
+        devices: how many to use, of each process.
 
     Raises:
         DraxError: more devices than there are, or a number that does not divide the share; or
@@ -43,8 +47,6 @@ def mesh_for(count: int, devices: int | None) -> Mesh | None:
     if processes > 1:  # meet: the first time they wait for each other for half a minute only
         multihost_utils.process_allgather(np.zeros(1))
     count //= processes
-    if devices is None:
-        devices = max(n for n in range(1, len(present) + 1) if count % n == 0)
     if (
         not isinstance(devices, int | np.integer)
         or isinstance(devices, bool)

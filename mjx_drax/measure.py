@@ -161,7 +161,7 @@ def ours(
     seed: int,
     name: str = OURS,
     probes: int = PROBES,
-    devices: int | None = None,
+    devices: int = 1,
 ) -> Row:
     """A solve, and when its first answer was there; with probes=0, only when its last one was."""
     solution = solve(problem, chains, seed, solver, devices=devices)

@@ -231,7 +231,7 @@ def run(
     guess: Trajectory | None = None,
     progress: Progress | None = None,
     recorder: Recorder | None = None,
-    devices: int | None = None,
+    devices: int = 1,
     checkpoint: Checkpoint | None = None,
 ) -> Run:
     """The iterations of `solve`, for problems that need no replay; the same arguments."""

@@ -25,7 +25,7 @@ problem = from_function(
     u_bounds=(-2.0, 2.0),
 )
 solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, attempts=2)
-alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, None))
+alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, 8))
 np.testing.assert_allclose(spread.trajectories.u, alone.trajectories.u, atol=1e-4)
 np.testing.assert_allclose(spread.cost, alone.cost, rtol=1e-4)
 
@@ -37,10 +37,10 @@ def kill(*_):
 
 checkpoint.EVERY = 0.0
 try:
-    solve(problem, 8, 0, solver, progress=kill, checkpoint=sys.argv[1])
+    solve(problem, 8, 0, solver, progress=kill, devices=8, checkpoint=sys.argv[1])
 except Killed:
     pass
-resumed = solve(problem, 8, 0, solver, checkpoint=sys.argv[1])
+resumed = solve(problem, 8, 0, solver, devices=8, checkpoint=sys.argv[1])
 two, four = (solve(problem, 8, 0, solver, devices=n) for n in (2, 4))
 for one, other in ((resumed, spread), (two, four)):
     np.testing.assert_array_equal(one.trajectories.u, other.trajectories.u)
@@ -134,4 +134,4 @@ def test_devices_that_are_not_there_are_refused(devices):
 
 
 def test_one_device_needs_no_mesh():
-    assert mesh_for(7, None) is None
+    assert mesh_for(7) is None
