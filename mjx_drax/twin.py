@@ -297,7 +297,7 @@ def constraint_rows(model: mjx.Model) -> int:
 
 def contact_points(model: mjx.Model) -> np.ndarray:
     """Friction dimensions (condim) of the contact points in a step, (n,), active or not."""
-    return np.asarray(jax.eval_shape(mjx.make_data, model)._impl.contact.dim)
+    return np.asarray(jax.eval_shape(mjx.make_data, model)._impl.contact.dim, int)
 
 
 def nearest_only(model: mjx.Model) -> int | None:
