@@ -56,7 +56,7 @@ class Agreement:
 class Engine:
     """Single steps of the C engine, x = [qpos, qvel, act], with constraints solved to rounding."""
 
-    def __init__(self, model: mujoco.MjModel, contacts: bool = True) -> None:
+    def __init__(self, model: mujoco.MjModel, contacts: bool | int = True) -> None:
         self.model = copy.deepcopy(model)
         self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
         self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -70,6 +70,14 @@ class Engine:
         data.ctrl[:] = u
         mujoco.mj_step(model, data, steps)
         return np.concatenate([data.qpos, data.qvel, data.act])
+
+    def touching(self, x: np.ndarray) -> int:
+        """Contacts that act at x (nx,), of the friction dimension that has the most."""
+        data = mujoco.MjData(self.model)
+        host.set_state(self.model, data, x)
+        mujoco.mj_forward(self.model, data)
+        acting = data.contact.dim[data.contact.efc_address >= 0]
+        return int(np.bincount(acting, minlength=1).max())
 
     def jacobian(self, x: np.ndarray, u: np.ndarray, eps: float = 1e-6) -> np.ndarray:
         """[df/dx df/du] (ndx, ndx + nu) by central differences in tangent space."""
@@ -109,7 +117,7 @@ def probes(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int = 
 def compare(
     model: mujoco.MjModel,
     at: Probes,
-    contacts: bool = True,
+    contacts: bool | int = True,
     bounded: np.ndarray | None = None,
     derivatives: bool = False,
 ) -> Agreement:
@@ -159,7 +167,7 @@ def require(
     model: mujoco.MjModel,
     name: str,
     x_init: np.ndarray,
-    contacts: bool,
+    contacts: bool | int,
     bounded: np.ndarray,
 ) -> None:
     """Refuse or warn of a model that MJX is known to compute differently, if it does so.
@@ -182,3 +190,25 @@ def require(
         raise DraxError(f"{words}.")
     if error > NOTICEABLE:
         warnings.warn(f"{words}.", DraxWarning, stacklevel=3)
+
+
+def require_near(
+    model: mujoco.MjModel, name: str, x_init: np.ndarray, kept: int | None, bounded: np.ndarray
+) -> None:
+    """Warn where more contacts act than a plan keeps; `kept` are of each friction dimension.
+
+    What is left out has no force in the plan, and the certificate would find that out later.
+    """
+    if kept is None:
+        return
+    engine = Engine(model)
+    at = probes(engine, x_init, bounded).x
+    most = max(engine.touching(x) for x in at)
+    if most > kept:
+        warnings.warn(
+            f"{engine.touching(x_init)} contacts of one friction dimension act at the x_init of "
+            f"{name} and up to {most} soon after, of which the plan keeps the nearest {kept}: give "
+            f"contacts={most}.",
+            DraxWarning,
+            stacklevel=3,
+        )

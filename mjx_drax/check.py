@@ -19,7 +19,15 @@ from mjx_drax.mjcf import (
     require_movable,
     steps_between_knots,
 )
-from mjx_drax.twin import constraint_rows, contact_pairs, differences, moments, twin
+from mjx_drax.twin import (
+    constraint_rows,
+    contact_pairs,
+    contact_points,
+    differences,
+    moments,
+    nearest_only,
+    twin,
+)
 
 Report = dict[str, Any]
 
@@ -34,9 +42,10 @@ def check(
         progress: called with a line before what takes long.
 
     Returns:
-        `sizes`, `timing`, `joints`, `actuators`, `contact_pairs`, `differences`, `agreement` (None
-        where the step could not be compiled) and `obstacle`: a sentence, or None if the model can
-        be used.
+        `sizes`, `timing`, `joints`, `actuators`, `contact_pairs`, `contact_points` (`all`, those
+        that a plan has `kept`, and of how many it keeps `nearest` of each friction dimension, None
+        if all), `differences`, `agreement` (None where the step could not be compiled) and
+        `obstacle`: a sentence, or None if the model can be used.
 
     Raises:
         DraxError: the file is missing or MuJoCo cannot compile it.
@@ -62,6 +71,7 @@ def check(
         "joints": [],
         "actuators": [_actuator(model, a) for a in range(model.nu)],
         "contact_pairs": sum(1 for _ in contact_pairs(model)),
+        "contact_points": {"all": None, "kept": None, "nearest": None},
         "differences": differences(model),
         "agreement": None,
         "obstacle": None,
@@ -71,7 +81,13 @@ def check(
         x_init = initial_state(model, name, None)
         bounded = bounded_joints(model, x_init)
         report["joints"] = _joints(model, bounded)
-        report["sizes"]["constraint_rows"] = constraint_rows(twin(model, bounded=bounded))
+        planned = twin(model, bounded=bounded)
+        report["sizes"]["constraint_rows"] = constraint_rows(planned)
+        report["contact_points"] = {
+            "all": len(contact_points(twin(model, np.iinfo(int).max))),
+            "kept": len(contact_points(planned)),
+            "nearest": nearest_only(planned),
+        }
         progress(f"{name}: compiling one step of MJX and its derivatives ...")
         report["agreement"] = _agreement(model, x_init, bounded)
         error = report["agreement"]["velocity_error"]
@@ -145,12 +161,17 @@ def _name(element: Any, otherwise: str) -> str:
 def text(report: Report) -> str:
     """The report for a person."""
     sizes, timing = report["sizes"], report["timing"]
-    rows = sizes["constraint_rows"]
+    rows, points = sizes["constraint_rows"], report["contact_points"]
+    if points["kept"] == points["all"]:
+        kept = "all of them in a plan"
+    else:
+        kept = f"a plan keeps {points['kept']}, the nearest {points['nearest']} of each condim"
     lines = [
         f"model        {report['model']}",
         "sizes        " + ", ".join(f"{k} {sizes[k]}" for k in ("nq", "nv", "nu", "na", "ndx")),
         f"constraints  {'unknown' if rows is None else rows} rows, "
         f"{report['contact_pairs']} pairs of geoms that may touch",
+        f"contacts     {'unknown' if rows is None else points['all']} points, {kept}",
         f"time         timestep {timing['timestep']:g} s, dt {timing['dt']:g} s, "
         f"integrator {timing['integrator']}",
     ]

@@ -39,7 +39,7 @@ on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
   x_bounds, u_bounds       (lower, upper)
   x_scatter, u_scatter     (lower, upper): where initial knots are drawn
   guess(key) -> Trajectory initial knots of one chain
-  contacts                 False: the plan knows no contacts; constraints keep things apart
+  contacts                 how many contact points the plan keeps, the nearest ones; False: none
   derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin
 """

@@ -45,7 +45,7 @@ from mjx_drax.problem import (
 )
 from mjx_drax.scalar import scalarized
 from mjx_drax.source import Source, is_xml
-from mjx_drax.twin import driven, free_ranges, has_constraints, twin
+from mjx_drax.twin import driven, free_ranges, has_constraints, nearest_only, twin
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
@@ -223,9 +223,12 @@ class MjxDynamics(Dynamics):
         return has_constraints(self.model)
 
     @property
-    def contacts(self) -> bool:
-        """Whether the plan knows contacts."""
-        return not int(self.model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    def contacts(self) -> bool | int:
+        """Whether the plan knows contacts, or how many of each friction dimension it keeps."""
+        if int(self.model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT):
+            return False
+        points = nearest_only(self.model)
+        return True if points is None else points
 
     def differentiator(self, by: Any) -> Any:
         """Exact derivatives in scalar arithmetic; others as they are."""
@@ -459,7 +462,7 @@ def from_mjcf(
     u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
-    contacts: bool = True,
+    contacts: bool | int = True,
     derivatives: Differentiator | None = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
@@ -493,8 +496,10 @@ def from_mjcf(
             act, chains start nearer to x_init, some more than others: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
-        contacts: False plans as if nothing could touch, which is right where constraints keep
-            things apart. The C engine that certifies keeps its contacts.
+        contacts: how many contact points the plan keeps, of each friction dimension (condim): the
+            nearest ones in every state. True keeps all where there are at most 32, else 32. False
+            plans as if nothing could touch, which is right where constraints keep things apart. The
+            C engine that certifies keeps all its contacts.
         derivatives: of f; by default exact, also in contact. `Smoothed()` fits them to samples,
             which feel a contact from as far as they are drawn.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
@@ -520,8 +525,6 @@ def from_mjcf(
         goal=goal,
         guess=guess,
     )
-    if not isinstance(contacts, bool | np.bool_):
-        raise DraxError(f"contacts is {shown(contacts)}: give True or False.")
     if derivatives is not None:
         require_part("derivatives", derivatives, "jacobian", "Smoothed()")
     host = load(model)
@@ -541,6 +544,7 @@ def from_mjcf(
     )
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
     agreement.require(host, name, x0, contacts, bounded)
+    agreement.require_near(host, name, x0, nearest_only(dynamics.model), bounded)
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
     )

@@ -17,27 +17,37 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax._mujoco import mujoco
-from mjx_drax.errors import DraxError
+from mjx_drax.errors import DraxError, shown
 from mjx_drax.physics import mjx
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
 
+NEAREST = 32
+"""Contact points of each friction dimension (condim) that a plan keeps, if it is not told how many:
+as many as eight boxes on the floor have. A step with half as many takes as long."""
+
+_LIMIT = "max_contact_points"
+"""The custom number of a model that MJX keeps so many contact points by."""
+
 
 def twin(
-    model: mujoco.MjModel, contacts: bool = True, bounded: np.ndarray | None = None
+    model: mujoco.MjModel, contacts: bool | int = True, bounded: np.ndarray | None = None
 ) -> mjx.Model:
     """The MJX model of a MuJoCo model.
 
     Args:
         model: which is not changed.
-        contacts: False leaves contacts out.
+        contacts: False leaves contacts out; a number keeps so many contact points of each friction
+            dimension (condim), the nearest ones in every state; True keeps `NEAREST`.
         bounded: joints whose limits the knots keep to, (njnt,). Inside them the limit's force is
             zero, so its constraint row is left out; the C engine keeps it.
 
     Raises:
         DraxError: MJX does not support the model; says what and what to do.
     """
+    if contacts is not True and not (isinstance(contacts, int | np.integer) and contacts >= 0):
+        raise DraxError(f"contacts is {shown(contacts)}: give True, False or a whole number.")
     mended = copy.deepcopy(model)
     if bounded is not None:
         mended.jnt_limited[bounded] = 0
@@ -46,12 +56,32 @@ def twin(
     _mend(mended)
     try:
         on_device = mjx.put_model(mended, device=jax.local_devices()[0], impl="jax")
-        jax.eval_shape(mjx.make_data, on_device)
+        on_device = _with_nearest(on_device, contacts)
     except (NotImplementedError, ValueError) as error:
         raise DraxError(_refusal(mended, str(error))) from error
     # MJX commits its arrays to a device. What is computed from them is then committed as well, and
     # a loop that is fed its own output would be compiled a second time.
     return _with_springs(jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device))
+
+
+def _with_nearest(model: mjx.Model, contacts: bool | int) -> mjx.Model:
+    """The model with no more than the nearest contact points, where it has more.
+
+    MJX reads how many to keep from a custom number of the model. It is added here, not in the MJCF,
+    because a model may come compiled. MJX's other number, `max_geom_pairs`, is left alone: it
+    chooses pairs by spheres about them before it knows distances, and so loses contacts.
+    """
+    points = NEAREST if contacts is True else int(contacts)
+    if np.bincount(contact_points(model), minlength=1).max() <= points:
+        return model
+    return model.replace(
+        nnumeric=model.nnumeric + 1,
+        # MJX takes the i-th entry for the i-th number, though numbers may have several entries
+        numeric_data=np.append(model.numeric_data[model.numeric_adr], points),
+        numeric_adr=np.arange(model.nnumeric + 1),
+        name_numericadr=np.append(model.name_numericadr, len(model.names)),
+        names=model.names + _LIMIT.encode() + b"\0",  # the last of this name counts
+    )
 
 
 def _with_springs(model: mjx.Model) -> mjx.Model:
@@ -87,6 +117,8 @@ def _mend(model: mujoco.MjModel) -> None:
         # Otherwise MJX refuses what it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
+        touch = model.sensor_type == int(mujoco.mjtSensor.mjSENS_TOUCH)
+        model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
     silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
     model.actuator_gainprm[silent] = 0.0
     model.actuator_biasprm[silent] = 0.0
@@ -160,7 +192,7 @@ _ROUGH = {
 """Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 0.7."""
 
 
-def differences(model: mujoco.MjModel, contacts: bool = True) -> list[str]:
+def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]:
     """What MJX computes differently from the C engine in this model, a sentence each.
 
     Found by comparing one step of both over many models: each moved velocities by 2e-5 to 0.7.
@@ -262,6 +294,17 @@ def control_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 def constraint_rows(model: mjx.Model) -> int:
     """Rows that constraint forces are solved for in a step, whether they are active or not."""
     return int(jax.eval_shape(mjx.make_data, model)._impl.efc_J.shape[0])
+
+
+def contact_points(model: mjx.Model) -> np.ndarray:
+    """Friction dimensions (condim) of the contact points in a step, (n,), active or not."""
+    return np.asarray(jax.eval_shape(mjx.make_data, model)._impl.contact.dim, int)
+
+
+def nearest_only(model: mjx.Model) -> int | None:
+    """Of how many contact points of a friction dimension a step knows the forces; None: of all."""
+    i = mjx.name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _LIMIT)
+    return int(model.numeric_data[i]) if i >= 0 and model.numeric_data[i] >= 0 else None
 
 
 def has_constraints(model: mjx.Model) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Geometric, Solution, cli, tasks
+from mjx_drax.check import text
 from mjx_drax.cli import main
 from mjx_drax.restarts import CHUNK
 
@@ -278,6 +279,7 @@ def test_check_says_what_becomes_of_a_model(own, capsys):
     for words in (
         "nq 1, nv 1, nu 1, na 0, ndx 2",
         "0 rows, 0 pairs",
+        "0 points, all of them in a plan",
         "timestep 0.01 s, dt 0.02 s, integrator EULER",
         "slide: slide, range -1 to 1 is a bound on knots, driven by actuator 0",
         "actuator 0: motor on joint slide, control -1 to 1",
@@ -290,6 +292,9 @@ def test_check_says_what_becomes_of_a_model(own, capsys):
     assert report["agreement"]["velocity_error"] < 1e-12
     assert report["agreement"]["jacobian_error_at_x_init"] < 1e-8
     assert report["obstacle"] is None
+    assert report["contact_points"] == {"all": 0, "kept": 0, "nearest": None}
+    report["contact_points"] = {"all": 177, "kept": 64, "nearest": 32}
+    assert "177 points, a plan keeps 64, the nearest 32 of each condim" in text(report)
 
 
 def test_check_says_what_stands_in_the_way(own, capsys):

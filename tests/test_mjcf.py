@@ -370,7 +370,7 @@ def test_another_initial_state_is_checked_too():
         task.with_x_init([0.1])
 
 
-BALL = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
+FALLING = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
 <body pos="0 0 0.15"><freejoint/><geom size="0.1"/></body>
 <body pos="0 1 1"><joint name="j" axis="1 0 0"/>
 <geom type="capsule" size="0.05" fromto="0 0 0 0 0 -0.5"/></body></worldbody>
@@ -378,7 +378,7 @@ BALL = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1
 
 
 def test_replays_are_those_of_the_c_engine_and_a_chain_that_blows_up_leaves_others_alone():
-    dynamics = from_mjcf(BALL, horizon=0.4, dt=0.02, running_residual=lambda data, u: u).dynamics
+    dynamics = from_mjcf(FALLING, horizon=0.4, dt=0.02, running_residual=lambda data, u: u).dynamics
     model, rng, chains, K = dynamics.mj_model, np.random.default_rng(0), 20, 20
     x0 = np.concatenate([model.qpos0, np.zeros(model.nv)])
     plan = np.broadcast_to(x0, (chains, K + 1, len(x0))).copy()

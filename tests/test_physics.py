@@ -13,6 +13,7 @@ import pytest
 
 from mjx_drax import Autodiff, Smoothed, from_mjcf, host
 from mjx_drax.agreement import Engine
+from mjx_drax.errors import DraxWarning
 from mjx_drax.linearize import linearize
 from mjx_drax.problem import Trajectory
 
@@ -119,11 +120,21 @@ STATES = {
     ],
 )
 def test_a_step_and_its_jacobian_are_the_c_engines(xml):
-    model = mujoco.MjModel.from_xml_string(xml)
+    assert_steps_like_the_c_engine(mujoco.MjModel.from_xml_string(xml), STATES[xml])
+
+
+def assert_steps_like_the_c_engine(model, states, **options):
+    """The values and the derivatives of one step, in float64, at states that `at` makes."""
     engine = Engine(model)
     control = np.array([1.0, 0.2])[: model.nu]
     with jax.enable_x64(True):
-        task = from_mjcf(model, horizon=0.1, dt=model.opt.timestep, running_residual=lambda d, u: u)
+        task = from_mjcf(
+            model,
+            horizon=0.1,
+            dt=model.opt.timestep,
+            running_residual=lambda d, u: u,
+            **options,
+        )
         dynamics, ndx = task.dynamics, task.dynamics.ndx
 
         def moved(x, end, dz):
@@ -135,7 +146,7 @@ def test_a_step_and_its_jacobian_are_the_c_engines(xml):
             end = dynamics.step(x, control)
             return end, jax.jacfwd(partial(moved, x, end))(jnp.zeros(ndx + model.nu))
 
-        for name, parts in STATES[xml].items():
+        for name, parts in states.items():
             x = at(model, **parts)
             end, jacobian = map(np.asarray, expanded(x))
             off = host.difference(model, end, engine.step(x, control))
@@ -144,6 +155,78 @@ def test_a_step_and_its_jacobian_are_the_c_engines(xml):
             np.testing.assert_allclose(
                 jacobian / scale, engine.jacobian(x, control) / scale, atol=1e-6, err_msg=name
             )
+
+
+BALLS = """
+<mujoco model="balls">
+  <option timestep="0.002"/>
+  <custom><numeric name="other" data="1 2 3"/><numeric name="max_contact_points" data="6"/></custom>
+  <worldbody>
+    <geom type="plane" size="1 1 1" condim="1"/>
+    {}
+  </worldbody>
+  <actuator><motor joint="x0"/></actuator>
+</mujoco>
+""".format(
+    "".join(
+        f"""<body pos="{0.5 * i} 0 0.1"><joint name="x{i}" type="slide" axis="1 0 0"/>
+        <joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+        <geom size="0.1" mass="1" condim="{dim}"/></body>"""
+        for i, dim in enumerate([3, 3, 1, 1])
+    )
+)
+"""Of ten pairs of balls and floor, seven have friction; MJX collides six of those at most."""
+
+X, Z, TURN = 0, 1, 2
+"""Joints of a ball."""
+
+
+def ball(i, joint):
+    """Where a joint of a ball stands in qpos and qvel."""
+    return 3 * i + joint
+
+
+def test_the_nearest_contacts_are_enough_where_no_more_act():
+    """Two contacts of each friction dimension, with ties among those that act and that do not.
+
+    The ball that is turned slides; what is deep inside another is pushed out.
+    """
+    model = mujoco.MjModel.from_xml_string(BALLS)
+    floating = {ball(i, Z): 0.5 for i in range(4)}
+    sinking = {ball(i, Z): -1e-4 for i in range(4)}
+    deep = {ball(1, X): -0.45, ball(2, X): -0.2, ball(2, Z): 0.7, ball(3, Z): 0.75}
+    states = {
+        "none acts, all tie": {"qpos": floating},
+        "as many as are kept, all tie": {"qpos": sinking, "qvel": {ball(0, X): 0.1}},
+        "balls in each other, one in the floor": {
+            "qpos": {**floating, **deep, ball(0, Z): 0.5, ball(3, X): -1.0, ball(3, Z): -0.02},
+            "qvel": {ball(1, Z): 0.3, ball(0, TURN): 1.0},
+        },
+    }
+    for name, parts in states.items():
+        assert Engine(model).touching(at(model, **parts)) <= 2, name
+    assert_steps_like_the_c_engine(model, states, contacts=2)
+
+
+def test_contacts_that_act_and_are_left_out_are_told():
+    """The plan lets a ball fall through the floor that the C engine keeps it on."""
+    model = mujoco.MjModel.from_xml_string(BALLS)
+    resting = at(model, qpos={ball(i, Z): -1e-4 * (i + 1) for i in range(4)})
+    with pytest.warns(DraxWarning, match=r"2 contacts .* balls .*nearest 1: give contacts=\d\."):
+        problem = from_mjcf(
+            model,
+            horizon=0.1,
+            dt=0.002,
+            x_init=resting,
+            contacts=1,
+            running_residual=lambda data, u: u,
+        )
+    assert problem.dynamics.contacts == 1
+    end = np.asarray(problem.dynamics.step(problem.x_init, jnp.zeros(1)))
+    falling = end[model.nq :][[ball(i, Z) for i in range(4)]] < -0.01
+    assert falling.tolist() == [True, False, True, False]
+    wanted = Engine(model).step(resting, np.zeros(1))
+    assert np.all(wanted[model.nq :] > -0.01)
 
 
 def test_smoothed_derivatives_feel_a_contact_from_afar():

@@ -1,5 +1,6 @@
 """What becomes of a model that MJX does not know: mended, refused, or named among differences."""
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -7,7 +8,17 @@ import pytest
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.agreement import Probes, compare
 from mjx_drax.errors import DraxWarning
-from mjx_drax.twin import contact_pairs, differences, driven, has_constraints, twin
+from mjx_drax.twin import (
+    NEAREST,
+    constraint_rows,
+    contact_pairs,
+    contact_points,
+    differences,
+    driven,
+    has_constraints,
+    nearest_only,
+    twin,
+)
 
 CHAIN = """
 <mujoco model="chain">
@@ -138,8 +149,48 @@ def test_contacts_that_mjx_cannot_make_can_be_left_out():
     assert not has_constraints(twin(model))
 
 
-CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'
+def test_a_plan_keeps_the_nearest_contacts_of_a_model_that_has_many():
+    """Balls in a row: 666 pairs of balls, which have friction, and one of a ball with the floor."""
+    balls = "".join(
+        f'<body pos="{i} 0 0"><joint axis="0 1 0"/><geom size="0.1" pos="0.1 0 0"/></body>'
+        for i in range(37)
+    )
+    custom = '<custom><numeric name="pair" data="1 2"/></custom>'
+    floor = '<contact><pair geom1="floor" geom2="ball" condim="1"/></contact>'
+    model = chain(before=f"{custom}<worldbody>{balls}</worldbody>", more=floor)
+    found = [twin(model, number) for number in (10_000, True, 2, 1)]
+    few = [np.bincount(contact_points(t))[[1, 3]].tolist() for t in found]
+    assert few == [[1, few[0][1]], [1, NEAREST], [1, 2], [1, 1]]
+    assert few[0][1] > 666
+    assert [nearest_only(t) for t in found] == [None, NEAREST, 2, 1]
+    assert [constraint_rows(t) for t in found[1:]] == [1 + 4 * n for n in (NEAREST, 2, 1)]
+    assert not has_constraints(twin(model, 0))
+
+
+def test_a_model_with_few_contacts_keeps_them_as_they_were():
+    model = chain()
+    same = twin(model)
+    assert nearest_only(same) is None
+    assert (same.nnumeric, same.names) == (model.nnumeric, model.names)
+    assert jax.tree.structure(same) == jax.tree.structure(twin(model, 3))
+    assert jax.tree.structure(same) != jax.tree.structure(twin(model, 2))
+
+
+@pytest.mark.parametrize("number", [-1, 2.5, "all", None])
+def test_numbers_of_contacts_are_whole(number):
+    with pytest.raises(DraxError, match=r"contacts is .*give True, False or a whole number"):
+        twin(chain(), number)
+
+
 TOUCH = "<sensor><{}/></sensor>"
+
+
+def test_touch_sensors_feel_nothing_where_contacts_are_left_out():
+    model = chain(more=TOUCH.format('touch site="tip"'))
+    assert compare(model, STATES, contacts=False).velocity.max() < 1e-10
+
+
+CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'
 
 
 @pytest.mark.parametrize(
