@@ -418,7 +418,7 @@ np.savez(sys.argv[2] + "/answer.npz", one.trajectories.u, one.cost, many.u, many
 """
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_killed_by_the_system_at_random_moments(kills, whole, whole_batch, tmp_path):
     here, answer = os.path.dirname(__file__), tmp_path / "answer.npz"
     command = [sys.executable, "-c", PROGRAM, here, str(tmp_path)]

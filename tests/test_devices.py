@@ -105,6 +105,7 @@ np.savez(out, u=found.trajectories.u, x=found.trajectories.x, cost=found.cost,
 """
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_answers_of_one(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -392,7 +392,7 @@ ARGUMENTS = [
     ("scatter-nan", lambda at: point(u_scatter=(NAN, NAN)), "lower end of u is nan"),
     ("scatter-text", lambda at: point(u_scatter="wide"), "bounds of u are 'wide'"),
     ("no-cost", lambda at: point(terminal_residual=None), "point has no cost", "give"),
-    ("contacts", lambda at: robot(contacts="some"), "contacts is 'some'", "True, False or a whole number"),
+    ("contacts", lambda at: robot(contacts="some"), "contacts is 'some'", "True, False or a"),
     ("derivatives-class", lambda at: robot(derivatives=Smoothed), "derivatives", "Smoothed()"),
     ("derivatives-text", lambda at: robot(derivatives="exact"), "derivatives is 'exact'"),
     ("problem-none", lambda at: solve(None), "the problem is None", "from_mjcf"),

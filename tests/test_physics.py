@@ -229,6 +229,7 @@ def test_contacts_that_act_and_are_left_out_are_told():
     assert np.all(wanted[model.nq :] > -0.01)
 
 
+@pytest.mark.slow
 def test_smoothed_derivatives_feel_a_contact_from_afar():
     """A ball falls towards a floor 2 mm below it; `derivatives` is the problem's own choice."""
     xml = """<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 0.1"/>

@@ -59,7 +59,7 @@ def test_chains_that_are_done_are_left_alone():
     assert (second.cost < first.cost).any()
 
 
-@pytest.mark.parametrize("weight", [1e-3, 1e4])
+@pytest.mark.parametrize("weight", [1e-3, pytest.param(1e4, marks=pytest.mark.slow)])
 def test_no_setting_depends_on_the_units_of_the_cost(weight):
     solver = Restarts(SHORT, attempts=1)
     usual, other = (solve(swing(w), chains=4, solver=solver) for w in (1.0, weight))
