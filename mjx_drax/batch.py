@@ -44,8 +44,8 @@ SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
 
 COPIES = 40
-"""Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes. An
-estimate on the safe side, not a measurement."""
+"""Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes. XLA
+plans with 7 to 8 for the cart-pole and the acrobot on a CPU; the rest is for what was not tried."""
 
 
 @dataclass(frozen=True)
