@@ -91,14 +91,18 @@ def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         forces = Context.create(model, data.replace(qacc=qacc), grad=False)
         return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
-    frozen = jax.lax.stop_gradient((model, data))
+    dense = (  # its product is one then, and not scattered sums, which GPUs are slow at
+        model.tree_replace({"opt.jacobian": mujoco.mjtJacobian.mjJAC_DENSE}),
+        data.tree_replace({"_impl.M": mjx.full_m(model, data)}),
+    )
+    frozen = jax.lax.stop_gradient(dense)
 
     def hessian(qacc: Array) -> Array:
         return symmetric(jax.jacfwd(lambda a: law(*frozen, a)[0])(qacc))
 
     found = _minimum(partial(law, *frozen), hessian, frozen[1].qacc_smooth)
-    qacc = found - solve(cholesky(hessian(found)), law(model, data, found)[0])
-    _, forces = law(model, data, qacc)
+    qacc = found - solve(cholesky(hessian(found)), law(*dense, found)[0])
+    _, forces = law(*dense, qacc)
     return data.replace(
         qacc=qacc,
         qfrc_constraint=forces.Ma - data.qfrc_smooth,
