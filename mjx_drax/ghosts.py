@@ -16,6 +16,7 @@ import numpy.typing as npt
 from mjx_drax import movie
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError, require_whole
+from mjx_drax.files import complete
 from mjx_drax.host import finite, interpolated
 from mjx_drax.rendering import FREE, Floats, open_drawer, set_pose, view_of
 
@@ -138,12 +139,8 @@ def render_timelapse(
     with open_drawer(model, 2 * height, 2 * width) as drawer:  # and halved, which smooths edges
         frame = drawer.render(stage.scene)
     image = Image.fromarray(frame).resize((width, height), Image.Resampling.BOX)
-    try:
-        image.save(target)
-    except OSError as error:
-        raise DraxError(
-            f"cannot write {target}: {error.strerror or error}; choose another place."
-        ) from error
+    with complete(target) as partial:
+        image.save(partial)
     return target
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 from collections.abc import Generator, Iterable, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mjx_drax.errors import DraxError, shown
-from mjx_drax.files import file_path
+from mjx_drax.files import complete, file_path
 
 if TYPE_CHECKING:
     from PIL import Image, ImageFont
@@ -45,22 +46,12 @@ def write(
       DraxError: before any frame is drawn, a suffix or folder that cannot be used.
     """
     target = film_path(path)
-    partial = target.with_name(f".{target.stem}.partial{target.suffix.lower()}")
-    try:
-        partial.touch()
-    except OSError as error:
-        raise DraxError(
-            f"cannot write {target}: {error.strerror or error}; choose another place."
-        ) from error
-    try:
+    with contextlib.closing(frames), complete(target) as partial:
+        partial.touch()  # complains before the first frame
         if target.suffix.lower() == ".mp4":
             _encode(partial, frames, fps, size)
         else:
             _animate(partial, frames, fps)
-        partial.replace(target)
-    finally:
-        frames.close()
-        partial.unlink(missing_ok=True)
     return target
 
 
@@ -80,11 +71,12 @@ def _animate(path: Path, frames: Iterable[Frame], fps: float) -> None:
     from PIL import Image
 
     images: list[Image.Image] = [Image.fromarray(frame) for frame in frames]
-    unit = 10 if path.suffix == ".gif" else 1  # [ms] what the format counts time in
+    gif = path.suffix.lower() == ".gif"
+    unit = 10 if gif else 1  # [ms] what the format counts time in
     ends = [unit * round(1000 * i / (fps * unit)) for i in range(len(images) + 1)]
     durations = [max(unit, b - a) for a, b in pairwise(ends)]
     options: dict[str, Any] = {"quality": _WEBP_QUALITY, "method": 4}
-    if path.suffix == ".gif":
+    if gif:
         images, options = _with_palette(images), {"optimize": False, "disposal": 1}
     images[0].save(
         path, save_all=True, append_images=images[1:], duration=durations, loop=0, **options

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.errors import DraxError
-from mjx_drax.files import file_path
+from mjx_drax.files import complete, file_path
 from mjx_drax.host import finite
 from mjx_drax.langevin import FEASIBLE
 from mjx_drax.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
@@ -144,15 +144,8 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Writes a figure as a PNG, its folder made if need be; or a DraxError."""
     target = file_path(path)
-    if target.suffix.lower() != ".png":
-        raise DraxError(f"a plot is written as .png, not {target.name!r}: rename it.")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_png(target)
-    except OSError as error:
-        raise DraxError(
-            f"cannot write {target}: {error.strerror or error}; choose another place."
-        ) from error
+    with complete(target, (".png",)) as partial:
+        FigureCanvasAgg(figure).print_png(partial)
     return target
 
 
