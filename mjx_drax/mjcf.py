@@ -6,7 +6,6 @@ The same model is stepped by MuJoCo's C engine, in float64, when a result is cer
 from __future__ import annotations
 
 import contextlib
-import copy
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -247,8 +246,7 @@ class MjxDynamics(Dynamics):
         x_{k+1} depends on x_k and u_k alone; `mj_step` in a loop starts it from the last knot's
         forces, and differs by the solver's tolerance.
         """
-        model = copy.copy(self.mj_model)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # to be seen below
+        model = self.mj_model
         lower, upper = (np.broadcast_to(side, u.shape[1:]) for side in limits)
         chains, knots = u.shape[:2]
         states, applied = np.full(plan.shape, np.nan), np.full(u.shape, np.nan)
@@ -282,7 +280,7 @@ class MjxDynamics(Dynamics):
                 )
                 now = steps[:, -1].copy()
                 sound &= (np.abs(now) < mujoco.mjMAXVAL).all(axis=1)
-                # After a warning the engine takes no further step
+                # What blows up is reset by the engine, its time too, and takes no further step
                 sound &= now[:, time] > (k + 1) * self.dt - 0.5 * model.opt.timestep
                 states[sound, k + 1] = now[sound, x]
         return states, applied

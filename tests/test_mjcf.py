@@ -404,3 +404,20 @@ def test_replays_are_those_of_the_c_engine_and_a_chain_that_blows_up_leaves_othe
             x = np.concatenate([data.qpos, data.qvel])
             np.testing.assert_allclose(states[c, k + 1], x, atol=1e-6)
     assert states[sound, -1, 2].min() < 0.11  # it lies on the plane
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_what_the_engine_would_reset_is_no_replay(substeps):
+    xml = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="j" type="slide"/>
+    <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody>
+    <actuator><motor joint="j"/></actuator></mujoco>"""
+    dynamics = problem(xml, dt=0.01 * substeps).dynamics
+    u = np.zeros((2, 5, 1))
+    u[1, 2:] = 9e9  # [N], less than a control may be, and velocities stay below 1e10 m/s
+    mj_model = dynamics.mj_model
+    mj_model.actuator_gear[0, 0] = 2.0  # but 1.8e10 m/s^2 is more than an acceleration may be
+    limits = (np.array(-np.inf), np.array(np.inf))
+    states, _ = dynamics.replay(np.zeros((2, 6, 2)), u, np.zeros((2, 5, 1, 2)), limits)
+    assert np.isfinite(states[0]).all()
+    assert np.isfinite(states[1, :3]).all()
+    assert np.isnan(states[1, 3:]).all()
