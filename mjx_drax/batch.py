@@ -459,10 +459,9 @@ class _Search:
         )
         for place, chain in enumerate(owners.T):
             cost, defect = found_cost[:, place], found_defect[:, place]
-            old_cost, old_defect = self.cost[indices, chain], self.defect[indices, chain]
-            feasible, was = defect < FEASIBLE, old_defect < FEASIBLE
-            better = np.where(feasible, cost < old_cost, defect < old_defect)
-            better = np.where(feasible == was, better, feasible)
+            infeasible, value = ranking(cost, defect)
+            was, before = ranking(self.cost[indices, chain], self.defect[indices, chain])
+            better = np.where(infeasible == was, value < before, was)
             rows, to = indices[better], chain[better]
             self.cost[rows, to], self.defect[rows, to] = cost[better], defect[better]
             self.x[rows, to], self.u[rows, to] = knots.x[better, place], knots.u[better, place]

@@ -10,11 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_drax.errors import (
-    DraxError,
-    reason,
-    require_not_negative,
-)
+from mjx_drax.errors import DraxError, reason, require_not_negative
 
 if TYPE_CHECKING:
     from types import ModuleType
