@@ -20,11 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
-from jax.sharding import PartitionSpec as P
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
-from mjx_drax.devices import SPLIT, divided, mesh_for, spread
+from mjx_drax.devices import gathered, mesh_for, spread
 from mjx_drax.errors import DraxError, reason, require_whole, shown
 from mjx_drax.functions import plain, require_functions
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking, worth
@@ -384,13 +383,13 @@ class _Search:
     def _resume(self, checkpoint: Checkpoint) -> None:
         """Go on from the checkpoint, if there is one; complain if it is of another question."""
         family = self.family
-        known = facts(family.problem, self.chains, self.seed, self.solver, self.mesh)
+        known = facts(family.problem, self.chains, self.seed, self.solver)
         sizes = {"problems": family.count, "chunk": self.size}
         checkpoint.require({"call": "solve_batch", **sizes, **known})
         checkpoint.require_room(sum(np.asarray(part).nbytes for part in self._saved().values()))
         flow, some, scales, knots, keys = self._begun(np.arange(self.size))
         tail = int(flow.tail) > 0
-        program = _flowed.lower(flow, some, scales, knots, keys, 0, tail, self.mesh)
+        program = _flowed.lower(flow, some, scales, knots, keys, 0, tail)
         functions = digest(program.as_text())
         checkpoint.require({"initial knots": digest(knots), "functions": functions})
         if checkpoint.found is not None:
@@ -407,13 +406,16 @@ class _Search:
         flow, some, *rows = self._begun(indices)
         total, tail = int(flow.iterations + flow.tail), int(flow.tail) > 0
 
-        def flowed(iterations: int) -> tuple[Trajectory, Array, Info]:
-            def each(rows: Any) -> tuple[Trajectory, Array, Info]:
-                where, *rest = rows
-                return _flowed(flow, some.some(where), *rest, iterations, tail, self.mesh)
+        def share(
+            rows: Any, flow: Langevin, some: Family, iterations: int
+        ) -> tuple[Trajectory, Array, Info]:
+            where, *rest = rows
+            return _flowed(flow, some.some(where), *rest, iterations, tail)
 
-            found: tuple[Trajectory, Array, Info] = divided(each, (np.arange(self.size), *rows))
-            return found
+        launch = spread(share, self.mesh, flow, some)
+
+        def flowed(iterations: int) -> tuple[Trajectory, Array, Info]:
+            return gathered(launch((np.arange(self.size), *rows), iterations), self.mesh)
 
         if not self.compile_time:
             jax.block_until_ready(flowed(0))
@@ -506,7 +508,7 @@ def _worth(family: Family, knots: Trajectory) -> tuple[Array, Array]:
     return family.over(worth)(family.problem, knots)
 
 
-@partial(jax.jit, static_argnames=("tail", "mesh"))
+@partial(jax.jit, static_argnames="tail")
 def _flowed(
     flow: Langevin,
     family: Family,
@@ -515,32 +517,19 @@ def _flowed(
     keys: Array,
     total: ArrayLike,
     tail: bool,
-    mesh: Mesh | None,
 ) -> tuple[Trajectory, Array, Info]:
     """All iterations of an attempt: knots, gains and diagnostics, (N, chains, ...)."""
 
-    def each(
-        flow: Langevin,
-        total: Array,
-        problem: Problem,
-        scales: Scale,
-        knots: Trajectory,
-        keys: Array,
+    def one(
+        problem: Problem, scale: Scale, knots: Trajectory, key: Array
     ) -> tuple[Trajectory, Array, Info]:
-        def one(
-            problem: Problem, scale: Scale, knots: Trajectory, key: Array
-        ) -> tuple[Trajectory, Array, Info]:
-            solver = replace(flow, scale=scale)
-            state = solver.init(problem, knots, jax.random.fold_in(key, 1))
-            state = advance(solver, problem, state, 0, total, tail)
-            found = replace(state.trajectory, slack=None)
-            return found, state.gains, evaluate(problem, state.trajectory)
+        solver = replace(flow, scale=scale)
+        state = solver.init(problem, knots, jax.random.fold_in(key, 1))
+        state = advance(solver, problem, state, 0, total, tail)
+        found = replace(state.trajectory, slack=None)
+        return found, state.gains, evaluate(problem, state.trajectory)
 
-        return family.over(one)(problem, scales, knots, keys)
-
-    specs = family.each(SPLIT, P())
-    part = spread(each, mesh, P(), P(), specs, SPLIT, SPLIT, SPLIT)
-    return part(flow, jnp.asarray(total), family.problem, scales, knots, keys)
+    return family.over(one)(family.problem, scales, knots, keys)
 
 
 def _replayed(family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> Replays:

@@ -4,7 +4,7 @@ The file is written every `EVERY` seconds of a solve and at its end, each time a
 all. A solve that finds it goes on from there, and its answer is bit for bit that of a solve which
 was left alone: the file holds all that the rest of a solve depends on, and belongs to one question:
 
-    chains, seed, settings, number of devices, versions, kind of device
+    chains, seed, settings, versions, kind of device
     every number of the problem, and the C engine's model       by digest
     the initial knots, whether drawn or given                   by digest
     the program that JAX makes of all functions                 by digest of its StableHLO text
@@ -33,7 +33,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 from mjx_drax import __version__
 from mjx_drax.errors import DraxError, DraxWarning
@@ -145,9 +144,7 @@ class Checkpoint:
         self._due = after + max(EVERY, (after - clock) / SHARE)
 
 
-def facts(
-    problem: Problem, chains: int, seed: int, solver: Any, mesh: Mesh | None
-) -> dict[str, Any]:
+def facts(problem: Problem, chains: int, seed: int, solver: Any) -> dict[str, Any]:
     """What is known of a question before anything is compiled, by names.
 
     Args:
@@ -155,7 +152,6 @@ def facts(
         chains: for each problem.
         seed: of all random numbers.
         solver: the settings, a `Restarts`.
-        mesh: the devices that the work is spread over; None for one.
     """
     from mjx_drax.settings import to_data
 
@@ -165,7 +161,6 @@ def facts(
         "chains": int(chains),
         "seed": int(seed),
         **_flat("settings", to_data(solver)),
-        "devices": 1 if mesh is None else int(mesh.size),
         **_flat("version", versions()),
         "device": jax.devices()[0].device_kind,
         "horizon": problem.horizon,

@@ -1,35 +1,38 @@
 """Chains, or problems, spread over processes and their devices; each works on its own share.
 
 Several processes, maybe on several hosts, are what `jax.distributed.initialize` makes of them. All
-run the same program with the same arguments. Each does the iterations of its share, and then they
-exchange what they found, so that everything else goes on in each of them as in one alone.
+run the same program with the same arguments. Arrays are sharded by rows over a mesh of all devices,
+and stay where they are while their rows are worked on; what the rest of a solve needs of them is
+gathered in every process.
 
-Chains exchange nothing and each has its own random key, so answers do not depend on the shares: two
-devices and four were seen to give the same, bit for bit. One device and several agree but for
-rounding: where numbers are divided by one of them, XLA multiplies by its reciprocal in a program of
-one device and divides in one of several. A single chain on a device rounds differently too, as its
-products are of matrices and no longer of batches of them.
+Chains exchange nothing and each has its own random key, so answers need not depend on the shares.
+For XLA to round alike too, every device runs the program of a single device on its share: programs
+that `jax.shard_map` makes of the same functions are simplified in another order, take up to four
+times as long to compile on a GPU, and end the process (jax 0.11) where an array holds no numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from mjx_drax.errors import DraxError
 
-SPLIT = P("share")
+Tree = TypeVar("Tree")
 
 
 def mesh_for(count: int, devices: int = 1) -> Mesh | None:
-    """The devices that a process spreads its share of `count` chains over, or None for one.
+    """The devices, of all processes, that `count` chains are spread over, or None for one.
 
     Args:
         count: chains, or problems, of all processes.
@@ -61,41 +64,72 @@ def mesh_for(count: int, devices: int = 1) -> Mesh | None:
             f"{count} chains or problems cannot be spread evenly over {devices} devices: give a "
             "multiple."
         )
-    return Mesh(np.array(present[:devices]), ("share",)) if devices > 1 else None
+    if processes * devices == 1:
+        return None
+    used = [[d for d in jax.devices() if d.process_index == i][:devices] for i in range(processes)]
+    return Mesh(np.array(used).ravel(), ("share",))
 
 
-def spread(function: Callable[..., Any], mesh: Mesh | None, *specs: Any) -> Callable[..., Any]:
-    """The function of arrays that are split (`SPLIT`) or whole (P()) on every device of a mesh.
+def spread(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Callable[..., Any]:
+    """program(rows, *whole, *numbers) as a function (rows, *numbers) of all rows.
 
-    Its results are split. Nothing is exchanged between devices, so kernels of our own need no rule
-    of how to partition them.
-    """
-    if mesh is None:
-        return function
-    return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=SPLIT, check_vma=False)
-
-
-def divided(work: Callable[[Any], Any], rows: Any) -> Any:
-    """work(rows), each process working on its share of them and getting the results of all.
+    Every device works on its share of the rows, all at the same time. A GPU's program with loops
+    holds up the thread that starts it, so each device has a thread.
 
     Args:
-        work: gives a tree whose leaves have a row for each that it was given, in their order.
-        rows: a tree of arrays with as many rows each, which the processes can share evenly.
+        program: of a tree of arrays with as many rows each, which the devices can share evenly; it
+            gives a tree of arrays with a row for each of these, in their order.
+        mesh: the devices, or None for one.
+        whole: trees that every device gets a copy of.
+
+    Returns:
+        a function whose results are split over the mesh, as its rows may be already.
     """
-    processes, index = jax.process_count(), jax.process_index()
-    if processes == 1:
-        return work(rows)
+    if mesh is None:
+        return lambda rows, *numbers: program(rows, *whole, *numbers)
+    copies = {device: jax.device_put(whole, device) for device in mesh.local_devices}
 
-    def mine(leaf: jax.Array) -> jax.Array:
-        count = len(leaf) // processes
-        return leaf[index * count : (index + 1) * count]
+    def launch(rows: Any, *numbers: Any) -> Any:
+        wide = jnp.result_type(float) == jnp.float64
 
-    return jax.tree.map(_exchanged, work(jax.tree.map(mine, rows)))
+        def work(device: jax.Device) -> Any:
+            with jax.enable_x64(wide):  # threads do not inherit it
+                mine = jax.tree.map(lambda leaf: _share(leaf, mesh, device), rows)
+                return program(mine, *copies[device], *numbers)
+
+        with ThreadPoolExecutor(len(copies)) as pool:
+            return jax.tree.map(lambda *shares: _joined(shares, mesh), *pool.map(work, copies))
+
+    return launch
 
 
-def _exchanged(rows: jax.Array) -> jax.Array:
-    """The rows of all processes, one after the other, on a device of this one."""
-    if jnp.issubdtype(rows.dtype, jax.dtypes.prng_key):
-        data = _exchanged(jax.random.key_data(rows))
-        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(rows))
-    return jnp.asarray(multihost_utils.process_allgather(rows, tiled=True))
+def gathered(tree: Tree, mesh: Mesh | None) -> Tree:
+    """The arrays that are split over a mesh, whole on the first device of this process."""
+    return tree if mesh is None else jax.tree.map(partial(_gathered, mesh), tree)
+
+
+def _share(leaf: Any, mesh: Mesh, device: jax.Device) -> Array:
+    """What that device works on, there."""
+    if isinstance(leaf, Array) and leaf.sharding == NamedSharding(mesh, P("share")):
+        return next(shard.data for shard in leaf.addressable_shards if shard.device == device)
+    count, index = len(leaf) // mesh.size, list(mesh.devices.flat).index(device)
+    return jax.device_put(leaf[index * count : (index + 1) * count], device)
+
+
+def _joined(shares: tuple[Array, ...], mesh: Mesh) -> Array:
+    """One array, from the shares of this process' devices in the order of the mesh."""
+    rows, *shape = shares[0].shape
+    split = NamedSharding(mesh, P("share"))
+    return jax.make_array_from_single_device_arrays((rows * mesh.size, *shape), split, shares)
+
+
+def _gathered(mesh: Mesh, leaf: Array) -> Array:
+    """All rows of an array, on the first device of this process."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        data = _gathered(mesh, jax.random.key_data(leaf))
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
+    if not leaf.is_fully_addressable:
+        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+    first, *_ = devices = mesh.local_devices  # copied by themselves: `device_put` of all goes
+    shares = [_share(leaf, mesh, device) for device in devices]  # through the host's memory
+    return jnp.concatenate(jax.device_put(shares, first))

@@ -89,7 +89,7 @@ def solve_lower(factor: Array, b: Array) -> Array:
         total = b[i]
         for j in range(i):
             total = total - factor[i, j] * out[j]
-        out.append(total / factor[i, i])
+        out.append(total * (1.0 / factor[i, i]))
     return jnp.stack(out)
 
 
@@ -106,7 +106,7 @@ def solve_upper(factor: Array, b: Array) -> Array:
         total = b[i]
         for j in range(i + 1, n):
             total = total - factor[j, i] * out[j]
-        out[i] = total / factor[i, i]
+        out[i] = total * (1.0 / factor[i, i])
     return jnp.stack(out)
 
 

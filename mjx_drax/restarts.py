@@ -30,12 +30,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
-from jax.sharding import PartitionSpec as P
 from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
-from mjx_drax.devices import SPLIT, divided, mesh_for, spread
+from mjx_drax.devices import gathered, mesh_for, spread
 from mjx_drax.errors import DraxError, require_not_negative, require_whole, shown
 from mjx_drax.functions import require_functions
 from mjx_drax.langevin import (
@@ -203,10 +202,6 @@ class Stand:
         """Iterations of the whole search, at the last report."""
         return self.records[-1][0]
 
-    def best(self) -> Attempt:
-        """The best of all attempts, this one included."""
-        return self.at if self.kept is None else _best(self.kept, self.at, self.owners)
-
 
 @dataclass(frozen=True)
 class Run(Attempt):
@@ -265,6 +260,7 @@ class _Search:
 
     stand: Stand
     clock: float
+    launch: tuple[Langevin, bool, Callable[..., Any]] | None = None
 
     def __init__(
         self,
@@ -309,7 +305,7 @@ class _Search:
             while True:
                 flow = self._flow(solver, self.stand.unit, self.stand.kept)
                 complete = self._attempt(flow, solver.iterations)
-                kept = self.stand.best()
+                kept = self._best()
                 ended = complete and not self._next(solver, kept)
                 if ended or not complete:
                     break
@@ -333,12 +329,23 @@ class _Search:
             return False
         if not kept.feasible.any():
             unit = MORE * unit  # the knots' cost says too little: penalize defects more
-        owners = np.resize(left, self.chains)
+        owners, kept = np.resize(left, self.chains), self._whole(kept)
         state, info = self._start(self._flow(solver, unit, kept), attempt)
         at, damping = Attempt(state, info, np.full(self.chains, -1)), np.ones(self.chains)
         history = stand.records, stand.began
         self.stand = Stand(attempt, unit, owners, kept, at, damping, *history)
         return True
+
+    def _best(self) -> Attempt:
+        """The best of all attempts, this one included."""
+        stand = self.stand
+        if stand.kept is None:
+            return stand.at
+        return _best(stand.kept, self._whole(stand.at), stand.owners)
+
+    def _whole(self, attempt: Attempt) -> Attempt:
+        """The attempt with its states on one device."""
+        return replace(attempt, state=gathered(attempt.state, self.mesh))
 
     def _flow(self, solver: Restarts, unit: float, kept: Attempt | None) -> Langevin:
         """The settings of an attempt after those that led to `kept`."""
@@ -352,7 +359,7 @@ class _Search:
     def _require(self, checkpoint: Checkpoint, solver: Restarts, flow: Langevin) -> None:
         """Complain now about a checkpoint of another question, or one that cannot be written."""
         problem, recorder = self.problem, self.recorder
-        known = facts(problem, self.chains, self.seed, solver, self.mesh)
+        known = facts(problem, self.chains, self.seed, solver)
         record = None if recorder is None else recorder.every
         checkpoint.require({"call": "solve", **known, "record": record})
 
@@ -382,7 +389,7 @@ class _Search:
             return 0.0, False
         state, tail = stand.at.state, int(flow.tail) > 0
         checkpoint.require({"initial knots": digest(state.trajectory)})
-        program = _advance.lower(flow, self.problem, state, 0, 0, tail, self.mesh)
+        program = _advance.lower(state, flow, self.problem, 0, 0, tail)
         checkpoint.require({"functions": digest(program.as_text())})
         if checkpoint.found is None:
             return 0.0, False
@@ -440,6 +447,7 @@ class _Search:
         if not kinked or flow.tail < STEPS or (self.stand.at.feasible.all() and not begun):
             return True
         try:
+            self.stand = replace(self.stand, at=self._whole(self.stand.at))
             while self.stand.mended < REPLAYS + MENDINGS:
                 self._mend(flow, expected)
         except KeyboardInterrupt:
@@ -469,7 +477,7 @@ class _Search:
         total = flow.iterations + flow.tail
         state = replace(kept.state, damping=jnp.asarray(damping, kept.state.damping.dtype))
         state, info = self._advanced(flow, state, total - STEPS, total)
-        return Attempt(state, info, np.full(self.chains, done))
+        return self._whole(Attempt(state, info, np.full(self.chains, done)))
 
     def _report(self, flow: Langevin, stand: Stand, done: int, expected: int) -> None:
         """Stand there, after `done` iterations of the search: record it, keep it and tell."""
@@ -484,7 +492,7 @@ class _Search:
         """Record knots too, if asked for."""
         if self.recorder is not None:
             stand, at = self.stand, self.stand.at
-            knots = at.state.trajectory
+            knots = gathered(at.state.trajectory, self.mesh)
             self.recorder.take(self.problem, flow, stand.step, stand.done, knots, at.info)
 
     def _replayed(self, flow: Langevin, kept: Attempt, with_feedback: float, done: int) -> Attempt:
@@ -495,7 +503,7 @@ class _Search:
         replayed = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
         state = _moved_to(flow, problem, kept.state, replayed)
         state, info = self._advanced(flow, state, 0, 0)  # compiled already; just evaluates
-        return Attempt(state, info, np.full(self.chains, done))
+        return self._whole(Attempt(state, info, np.full(self.chains, done)))
 
     def _attempt(self, flow: Langevin, expected: int) -> bool:
         """What is left of an attempt; False if it is interrupted."""
@@ -518,8 +526,9 @@ class _Search:
                 stop = min(stand.step + self._stride(total), total)
                 ahead = self._advanced(flow, at.state, stand.step, stop, tail)
                 state, info = jax.block_until_ready(ahead)
-                if before == 0 and (np.asarray(state.died_at) == 0).all():
-                    _require_sound(flow, self.problem, at.state.trajectory)
+                if before == 0 and (np.asarray(gathered(state.died_at, self.mesh)) == 0).all():
+                    knots = gathered(at.state.trajectory, self.mesh)
+                    _require_sound(flow, self.problem, knots)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(at.converged_at < 0, before + stop, at.converged_at)
                 at = Attempt(state, info, np.where(feasible, since, -1))
@@ -531,13 +540,12 @@ class _Search:
     def _advanced(
         self, flow: Langevin, state: State, start: int, stop: int, tail: bool = True
     ) -> tuple[State, Info]:
-        """Iterations start..stop-1 on all devices of all processes."""
-
-        def advanced(state: State) -> tuple[State, Info]:
-            return _advance(flow, self.problem, state, start, stop, tail, self.mesh)
-
-        found: tuple[State, Info] = divided(advanced, state)
-        return found
+        """Iterations start..stop-1 on all devices, where the states then stay."""
+        if self.launch is None or self.launch[0] is not flow or self.launch[1] != tail:
+            program = spread(partial(_advance, tail=tail), self.mesh, flow, self.problem)
+            self.launch = flow, tail, program
+        state, info = self.launch[2](state, start, stop)
+        return state, gathered(info, self.mesh)
 
     def _stride(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""
@@ -545,26 +553,18 @@ class _Search:
         return usual if self.recorder is None else min(usual, self.recorder.every)
 
 
-@partial(jax.jit, static_argnames=("tail", "mesh"))
+@partial(jax.jit, static_argnames="tail")
 def _advance(
+    state: State,
     flow: Langevin,
     problem: Problem,
-    state: State,
     start: ArrayLike,
     stop: ArrayLike,
     tail: bool,
-    mesh: Mesh | None = None,
 ) -> tuple[State, Info]:
     """`advance` and `evaluate` in one launch."""
-
-    def chains(
-        flow: Langevin, problem: Problem, state: State, start: Array, stop: Array
-    ) -> tuple[State, Info]:
-        state = advance(flow, problem, state, start, stop, tail)
-        return state, evaluate(problem, state.trajectory)
-
-    each = spread(chains, mesh, P(), P(), SPLIT, P(), P())
-    return each(flow, problem, state, jnp.asarray(start), jnp.asarray(stop))
+    state = advance(flow, problem, state, start, stop, tail)
+    return state, evaluate(problem, state.trajectory)
 
 
 _moved_to = jax.jit(Langevin.moved_to)

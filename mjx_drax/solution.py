@@ -300,9 +300,8 @@ def solve(
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for
             `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
             and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
-        devices: how many of this process to spread the chains over, evenly. On two H200 GPUs the
-            process died when more than one was asked for, which is not understood yet; on virtual
-            CPU devices it works.
+        devices: how many of this process to spread the chains over, evenly; the answer is the
+            same. Each compiles the program for itself, all at once.
         checkpoint: a file to write every half minute, and to go on from where it is there, after
             the same call was killed or ended by Ctrl-C. The answer is the same, bit for bit. A
             file that belongs to a complete solve gives its answer again; it may be deleted.

@@ -31,8 +31,12 @@ import jax
 assert len(jax.devices()) == 8
 solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, attempts=2)
 alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, 8))
-np.testing.assert_allclose(spread.trajectories.u, alone.trajectories.u, atol=1e-4)
-np.testing.assert_allclose(spread.cost, alone.cost, rtol=1e-4)
+
+def same(one, other):
+    np.testing.assert_array_equal(one.trajectories.u, other.trajectories.u)
+    np.testing.assert_array_equal(one.cost, other.cost)
+
+same(spread, alone)
 
 class Killed(BaseException):
     pass
@@ -43,19 +47,13 @@ def kill(*_):
 checkpoint.EVERY = 0.0
 with pytest.raises(Killed):
     solve(problem, 8, 0, solver, progress=kill, devices=8, checkpoint=sys.argv[1])
-resumed = solve(problem, 8, 0, solver, devices=8, checkpoint=sys.argv[1])
-two, four = (solve(problem, 8, 0, solver, devices=n) for n in (2, 4))
-for one, other in ((resumed, spread), (two, four)):
-    np.testing.assert_array_equal(one.trajectories.u, other.trajectories.u)
-    np.testing.assert_array_equal(one.cost, other.cost)
-with pytest.raises(DraxError, match="devices 8, and this solve has devices 2"):
-    solve(problem, 8, 0, solver, devices=2, checkpoint=sys.argv[1])
+same(solve(problem, 8, 0, solver, devices=2, checkpoint=sys.argv[1]), alone)
 starts = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 2)).astype(np.float32)
 alone, many = (
     solve_batch(lambda x: replace(problem, x_init=x), starts, 2, 0, solver, devices=n)
-    for n in (1, 8)
+    for n in (1, 2)
 )
-np.testing.assert_allclose(many.u, alone.u, atol=1e-4)
+np.testing.assert_array_equal(many.u, alone.u)
 print("same", spread.solve_time)
 """
 
@@ -116,7 +114,7 @@ def test_two_processes_give_the_answers_of_one(tmp_path):
     )
     for name in alone:
         np.testing.assert_array_equal(first[name], second[name])
-        np.testing.assert_allclose(first[name], alone[name], atol=1e-3)
+        np.testing.assert_array_equal(first[name], alone[name])
 
 
 @pytest.mark.parametrize("devices", [0, 1000, "two"])
