@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import register_dataclass
+from jax.typing import ArrayLike
 
 from mjx_drax.bounds import LogBarrier, Projection, Reflection, Sides
 from mjx_drax.constraints import Eliminated, eliminate, recover
@@ -347,16 +348,24 @@ def _diagonal(model: Model, trajectory: Trajectory, penalty: Array) -> Trajector
 @register_dataclass
 @dataclass(frozen=True)
 class GaussNewton(Memoryless):
-    """M = H + mu J'J + delta I, with H the Gauss-Newton model of c plus the barrier's diagonal.
+    """M = H + mu J'J + delta D, with H the Gauss-Newton model of c plus the barrier's diagonal.
 
-    The multipliers follow the predicted, noise-free residual: r = mu (h + J d).
+    D = I, but where f has kinks states have `light` instead of 1 on its diagonal. The multipliers
+    follow the predicted, noise-free residual: r = mu (h + J d).
 
     The ladder is short, because damping adapts: with ten sizes no more chains succeed, and the tail
     takes longer.
+
+    Attributes:
+        derivatives: of everything at a knot.
+        light: damping of states where f has kinks, as a share of that of controls. A contact moves
+            velocities within a knot by many times as much as positions, and knots that are damped
+            like controls do not get there within an attempt; docs/models.md has the numbers.
     """
 
     ladder = (1.0, 1 / 2, 1 / 4, 1 / 16, 0.0)
     derivatives: Differentiator = field(default_factory=Autodiff)
+    light: ArrayLike = 0.01
 
     def direction(
         self,
@@ -372,7 +381,8 @@ class GaussNewton(Memoryless):
         key_model, key_noise, key_slack = jax.random.split(key, 3)
         model = expand(problem, trajectory, self.derivatives, key_model)
         walls = _walls(problem, bounds, trajectory, levels.barrier, multipliers.bounds)
-        cost = _with_barrier(model.cost, *walls, levels.damping)
+        of_states = self.light if problem.dynamics.kinked else 1.0
+        cost = _with_barrier(model.cost, *walls, levels.damping, of_states)
         slope, curvature = (
             d.slack or Stagewise(jnp.zeros((problem.horizon, 0)), jnp.zeros(0)) for d in walls
         )
@@ -429,10 +439,14 @@ def _stage_steps(dx: Array, du: Array) -> Array:
 
 
 def _with_barrier(
-    cost: QuadraticCost, slope: Trajectory, curvature: Trajectory, damping: Array
+    cost: QuadraticCost,
+    slope: Trajectory,
+    curvature: Trajectory,
+    damping: Array,
+    of_states: ArrayLike,
 ) -> QuadraticCost:
-    """The model of c + rho b + delta/2 |dz|^2; there is no barrier on x_0, which is fixed."""
-    diagonal_x = jnp.full_like(cost.gx, damping).at[1:].add(curvature.x)
+    """The model of c + rho b + delta/2 (|du|^2 + of_states |dx|^2); x_0 is fixed: no barrier."""
+    diagonal_x = jnp.full_like(cost.gx, of_states * damping).at[1:].add(curvature.x)
     diagonal_u = damping + curvature.u
     return QuadraticCost(
         cost.gx.at[1:].add(slope.x),

@@ -3,16 +3,17 @@
 min 1/2 z'Hz + g'z   s.t.   h(z) = Jz + h0 = 0,     z = [x_1..x_K, u_0..u_{K-1}]
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.tree_util import Partial
+from jax.tree_util import Partial, register_dataclass
 from scipy.linalg import block_diag
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, Trajectory, from_function
+from mjx_drax.dynamics import FunctionDynamics
 from mjx_drax.langevin import advance, evaluate
 from mjx_drax.problem import box
 
@@ -103,6 +104,35 @@ def test_gauss_newtons_partial_steps_reach_it_too():
     solver = replace(QUIET, step_size=0.3, penalty=Constant(1e3), iterations=200)
     problem = program()
     assert_optimal(advance(solver, problem, start(solver, problem), 0, 200), 1e-9)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Kinked(FunctionDynamics):
+    kinked = True
+
+
+def test_states_are_damped_less_where_f_has_kinks():
+    """A full step is -(H + mu J'J + delta D)^-1 grad; another `light` does not recompile."""
+    quiet, problem, delta, mu = Langevin(noise=Constant(0.0)), program(), 0.3, 5.0
+    f = problem.dynamics
+    kinked = replace(problem, dynamics=Kinked(f.function, f.dt, f.nx, f.nu))
+    compiled = []
+    for task, light, of_states in ((kinked, 0.01, 0.01), (kinked, 0.5, 0.5), (problem, 0.01, 1.0)):
+        solver = replace(
+            quiet,
+            step_size=1.0,
+            penalty=Constant(mu),
+            damping=Constant(delta),
+            preconditioner=GaussNewton(light=light),
+        )
+        state = start(solver, task)
+        point, D = z(state)[0], np.diag([of_states] * N + [1.0] * K * NU)
+        slope = H @ point + g + mu * J.T @ (J @ point + h0)
+        expected = point - np.linalg.solve(H + mu * J.T @ J + delta * D, slope)
+        np.testing.assert_allclose(z(advance(solver, task, state, 0, 1))[0], expected, rtol=1e-9)
+        compiled.append(advance._cache_size())
+    assert compiled[0] == compiled[1]
 
 
 MU = 2.0
