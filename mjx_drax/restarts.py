@@ -47,9 +47,9 @@ from mjx_drax.langevin import (
     Langevin,
     Scale,
     State,
-    advance,
-    evaluate,
+    advance_and_evaluate,
     ranking,
+    undiagnosed,
 )
 from mjx_drax.problem import Problem, Trajectory, functions_of, numbers
 from mjx_drax.recording import LIMIT, Recorder, knot_defects
@@ -361,7 +361,8 @@ class _Search:
 
         def start() -> tuple[State, Info]:
             x, u = (jnp.zeros((*shape, n), dtype) for n in (nx, nu))
-            return _init(flow, problem, Trajectory(x, u), jax.random.key(0))
+            state = _init(flow, problem, Trajectory(x, u), jax.random.key(0))
+            return state, undiagnosed(state)
 
         def size(tree: Any) -> int:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
@@ -426,7 +427,10 @@ class _Search:
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
         if attempt == 0 and not hasattr(self.problem.dynamics, "mj_model"):
             _require_sound(flow, self.problem, knots)  # takes long for models: when they fail
-        return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
+        state = _init(flow, self.problem, knots, key_noise)
+        if self.checkpoint is not None and self.checkpoint.found is not None and attempt == 0:
+            return state, undiagnosed(state)  # it will be replaced; an answer needs no compiling
+        return jax.block_until_ready(self._advanced(flow, state, 0, 0, int(flow.tail) > 0))
 
     def _mended(self, flow: Langevin, expected: int) -> bool:
         """Lead the attempt's chains on along replays where f has kinks; False if interrupted.
@@ -555,13 +559,12 @@ def _advance(
     tail: bool,
     mesh: Mesh | None = None,
 ) -> tuple[State, Info]:
-    """`advance` and `evaluate` in one launch."""
+    """`advance_and_evaluate`, with the chains spread over a mesh of devices."""
 
     def chains(
         flow: Langevin, problem: Problem, state: State, start: Array, stop: Array
     ) -> tuple[State, Info]:
-        state = advance(flow, problem, state, start, stop, tail)
-        return state, evaluate(problem, state.trajectory)
+        return advance_and_evaluate(flow, problem, state, start, stop, tail)
 
     each = spread(chains, mesh, P(), P(), SPLIT, P(), P())
     return each(flow, problem, state, jnp.asarray(start), jnp.asarray(stop))
@@ -570,11 +573,7 @@ def _advance(
 _moved_to = jax.jit(Langevin.moved_to)
 
 
-@jax.jit
-def _init(flow: Langevin, problem: Problem, knots: Trajectory, key: Array) -> tuple[State, Info]:
-    """`Langevin.init` and `evaluate` in one launch."""
-    state = flow.init(problem, knots, key)
-    return state, evaluate(problem, state.trajectory)
+_init = jax.jit(Langevin.init)
 
 
 def _scale(cost: float, noise: float) -> Scale:
