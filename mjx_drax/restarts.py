@@ -296,7 +296,6 @@ class _Search:
         first = solver.first(unit)
         before, answered = self._resumed(first)
         if not answered:
-            jax.block_until_ready(self._advanced(first, state, 0, 0, int(flow.tail) > 0))
             if solver.attempts > 1:
                 _gather((state, info), (state, info), everyone)
             if self.recorder is not None:
@@ -398,6 +397,8 @@ class _Search:
         self.stand = replace(saved["stand"], records=tuple(records), began=began)
         if self.recorder is not None:
             self.recorder.restore(saved["recorder"])
+        if not saved["ended"]:
+            jax.block_until_ready(self._advanced(flow, state, 0, 0, tail))  # just compiles
         return saved["solve_time"], saved["ended"]
 
     def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:
