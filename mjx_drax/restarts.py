@@ -431,7 +431,8 @@ class _Search:
         state = _init(flow, self.problem, knots, key_noise)
         if self.checkpoint is not None and self.checkpoint.found is not None and attempt == 0:
             return state, undiagnosed(state)  # it will be replaced; an answer needs no compiling
-        return jax.block_until_ready(self._advanced(flow, state, 0, 0, int(flow.tail) > 0))
+        _, info = self._advanced(flow, state, 0, 0, int(flow.tail) > 0)
+        return jax.block_until_ready((state, info))
 
     def _mended(self, flow: Langevin, expected: int) -> bool:
         """Lead the attempt's chains on along replays where f has kinks; False if interrupted.
