@@ -43,10 +43,11 @@ from mjx_drax.precondition import (
     Identity,
     Levels,
     Multipliers,
+    at_rest,
     augmented_lagrangian,
     displaced,
 )
-from mjx_drax.problem import Problem, Stagewise, Trajectory, functions_of, numbers
+from mjx_drax.problem import Problem, Stagewise, Trajectory, Values, functions_of, numbers
 from mjx_drax.quasi_newton import LBFGS
 from mjx_drax.scalar import pruned
 from mjx_drax.schedules import Constant, Geometric
@@ -293,8 +294,25 @@ class Langevin:
         A caller that knows that there is no tail says so with tail=False (static): the choice
         between noise and line search, which a GPU waits for, is then left out.
         """
+        return self.stepped(problem, state, iteration, tail)[0]
+
+    def stepped(
+        self,
+        problem: Problem,
+        state: State,
+        iteration: ArrayLike,
+        tail: bool = True,
+        moves: Array | None = None,
+    ) -> tuple[State, Info]:
+        """`step`, and diagnostics where it ends, from its line search; zeros from other steps.
+
+        Where `moves` (a traced truth value) is False, the search stands still: the state stays what
+        it is, and is diagnosed. Given so, both take one copy of f in a compiled program.
+        """
         iteration = jnp.asarray(iteration)
         noisy = iteration < self.iterations
+        if moves is not None:
+            noisy = noisy & moves
         t = jnp.where(
             noisy,
             iteration / jnp.maximum(self.iterations - 1, 1),
@@ -322,11 +340,18 @@ class Langevin:
         present = state.multipliers
         if not tail:  # bounds have multipliers of their own in the tail only
             present = replace(present, bounds=None)
-        directions = jax.vmap(direction)(
-            state.trajectory, present, state.damping, state.key, state.memory
-        )
 
-        def diffuse(state: State) -> tuple[Trajectory, Array]:
+        def directed(state: State) -> Direction:
+            return jax.vmap(direction)(
+                state.trajectory, present, state.damping, state.key, state.memory
+            )
+
+        if moves is None:
+            directions = directed(state)
+        else:
+            directions = jax.lax.cond(moves, directed, partial(_still, problem), state)
+
+        def diffuse(state: State) -> tuple[Trajectory, Array, Info]:
             def move(
                 old: Trajectory, multipliers: Multipliers, to: Direction, key: Array
             ) -> Trajectory:
@@ -345,19 +370,21 @@ class Langevin:
                 return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
 
             moved = jax.vmap(move)(state.trajectory, state.multipliers, directions, state.key)
-            return moved, jnp.broadcast_to(jnp.asarray(self.step_size), state.alive.shape)
+            size = jnp.broadcast_to(jnp.asarray(self.step_size), state.alive.shape)
+            return moved, size, undiagnosed(state)
 
-        def descend(state: State) -> tuple[Trajectory, Array]:
+        def descend(state: State) -> tuple[Trajectory, Array, Info]:
             def search(
                 old: Trajectory, multipliers: Multipliers, to: Direction
-            ) -> tuple[Trajectory, Array]:
-                def merit(z: Trajectory) -> Array:
-                    return augmented_lagrangian(problem, self.bounds, z, multipliers, levels)
-
-                def attempt(size: Array) -> tuple[Array, Trajectory]:
+            ) -> tuple[Trajectory, Array, Info]:
+                def attempt(size: Array) -> tuple[Array, tuple[Trajectory, Array, Info]]:
                     change = jax.tree.map(lambda d: size * d, to.drift)
                     new = self._moved(problem, old, change)
-                    return merit(new), new
+                    values = problem.values(new)
+                    merit = augmented_lagrangian(
+                        problem, self.bounds, new, multipliers, levels, values
+                    )
+                    return merit, (new, size, _diagnosed(problem, new, values))
 
                 sizes = jnp.asarray(self.preconditioner.ladder, old.x.dtype)
                 merits, candidates = jax.vmap(attempt)(sizes)
@@ -365,14 +392,14 @@ class Langevin:
                 worst = jnp.finfo(gains.dtype).max  # which it does if nothing else is finite
                 gains = jnp.where(sizes > 0.0, gains, worst)
                 best = jnp.argmin(jnp.where(jnp.isfinite(gains), gains, jnp.inf))
-                return jax.tree.map(lambda z: z[best], candidates), sizes[best]
+                return jax.tree.map(lambda z: z[best], candidates)
 
             return jax.vmap(search)(state.trajectory, state.multipliers, directions)
 
         if tail:
-            trajectory, size = jax.lax.cond(noisy, diffuse, descend, state)
+            trajectory, size, info = jax.lax.cond(noisy, diffuse, descend, state)
         else:
-            trajectory, size = diffuse(state)
+            trajectory, size, info = diffuse(state)
         rate_size = jnp.ones_like(size) if self.preconditioner.multipliers_step_alone else size
         multipliers = jax.tree.map(
             lambda m, rate: m + _per_chain(rate_size, m) * rate,
@@ -388,7 +415,7 @@ class Langevin:
         )
         if tail:
             new = self._adapted(problem, state, new, size, levels, noisy)
-        return _keep_finite(state, new, iteration)
+        return _keep_finite(state, new, iteration, moves), info
 
     def _adapted(
         self,
@@ -497,8 +524,15 @@ def _per_chain(values: Array, like: Array) -> Array:
     return values.reshape(-1, *[1] * (like.ndim - 1))
 
 
-def _keep_finite(old: State, new: State, iteration: Array) -> State:
-    """The new state, where chains that would turn non-finite stay what they were."""
+def _still(problem: Problem, state: State) -> Direction:
+    """The direction of chains that stay where they are."""
+    drift = jax.vmap(partial(at_rest, problem))(state.trajectory)
+    rate = jax.tree.map(jnp.zeros_like, replace(state.multipliers, bounds=None))
+    return Direction(drift, drift, rate, state.gains, state.memory)
+
+
+def _keep_finite(old: State, new: State, iteration: Array, moves: Array | None = None) -> State:
+    """The new state, where chains that would turn non-finite, or do not move, stay as they were."""
     names = ("trajectory", "multipliers", "damping", "gains", "memory")
     before, after = ({name: getattr(state, name) for name in names} for state in (old, new))
     pairs = zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True)
@@ -506,8 +540,10 @@ def _keep_finite(old: State, new: State, iteration: Array) -> State:
     finite = jnp.stack([jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim))) for a in moved]).all(
         0
     )
+    finite = finite if moves is None else finite | ~moves
     alive = old.alive & finite
-    kept = jax.tree.map(lambda a, b: jnp.where(_per_chain(alive, a), a, b), after, before)
+    new_ones = alive if moves is None else alive & moves
+    kept = jax.tree.map(lambda a, b: jnp.where(_per_chain(new_ones, a), a, b), after, before)
     died_at = jnp.where(old.alive & ~finite, iteration, old.died_at)
     return replace(new, alive=alive, died_at=died_at, **kept)
 
@@ -523,11 +559,18 @@ def ranking(cost: ArrayLike, max_defect: ArrayLike) -> tuple[np.ndarray, np.ndar
 @exact
 def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     """Cost, max|h| and bound violation of a batch of trajectories."""
+    return jax.vmap(lambda z: _diagnosed(problem, z, problem.values(z)))(trajectory)
 
-    def one(z: Trajectory) -> Info:
-        return Info(problem.cost(z), problem.max_defect(z), problem.bounds.violation(z))
 
-    return jax.vmap(one)(trajectory)
+def _diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
+    """Cost, max|h| and bound violation of one trajectory, scalars."""
+    return Info(values.cost, problem.worst(values), problem.bounds.violation(trajectory))
+
+
+def undiagnosed(state: State) -> Info:
+    """Zeros in the place of diagnostics, (chains,) each."""
+    zeros = jnp.zeros(state.alive.shape)
+    return Info(zeros, zeros, zeros)
 
 
 @jax.jit
@@ -558,6 +601,31 @@ def advance(
         return solver.step(problem, state, i, tail)
 
     return jax.lax.fori_loop(start, stop, step, state)
+
+
+@partial(jax.jit, static_argnames="tail")
+@exact
+def advance_and_evaluate(
+    solver: Langevin,
+    problem: Problem,
+    state: State,
+    start: ArrayLike,
+    stop: ArrayLike,
+    tail: bool = True,
+) -> tuple[State, Info]:
+    """`advance` and `evaluate`; where f has kinks in one loop, which takes one round more.
+
+    Programs of contact models compile for as long as they are, and most of their length is f.
+    """
+    if not (tail and problem.dynamics.kinked):
+        state = advance(solver, problem, state, start, stop, tail)
+        return state, evaluate(problem, state.trajectory)
+
+    @pruned
+    def step(i: Array, carry: tuple[State, Info]) -> tuple[State, Info]:
+        return solver.stepped(problem, carry[0], i, moves=i < stop)
+
+    return jax.lax.fori_loop(start, jnp.asarray(stop) + 1, step, (state, undiagnosed(state)))
 
 
 @jax.jit

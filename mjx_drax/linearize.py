@@ -30,7 +30,9 @@ def linearize(
 ) -> Linearization:
     """The dynamics at every knot, with one random key for each, (K,)."""
     dynamics = problem.dynamics
-    ndx, by = dynamics.ndx, dynamics.derivatives or dynamics.differentiator(by)
+    if not dynamics.kinked:  # else f holds a loop that ends when it is done: no scalars, in vain
+        by = dynamics.differentiator(by)
+    ndx, by = dynamics.ndx, dynamics.derivatives or by
 
     def stage(x: Array, u: Array, x_next: Array, key: Array) -> Linearization:
         def defect(dz: Array) -> Array:

@@ -14,8 +14,6 @@ Three things differ from `mjx.step`, none of them in value:
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -25,13 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_drax._mjx import Context
+from mjx_drax._mjx import mjx as mjx
 from mjx_drax._mujoco import mujoco
 from mjx_drax.joints import Joints
 from mjx_drax.linalg import cholesky, solve, symmetric
-
-with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-    from mujoco import mjx as mjx  # announces that warp is missing; nothing here needs warp
-    from mujoco.mjx._src.solver import Context  # not public; the law of constraint forces
+from mjx_drax.tree import kinematics
 
 TURNING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
@@ -68,10 +65,19 @@ def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
     if turned.any():
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
         model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
-    data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
+    data = mjx.sensor_pos(model, _at_positions(model, data))
     data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     return mjx.sensor_acc(model, _constrained(model, data))
+
+
+def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_position`, with another kinematics."""
+    data = mjx.camlight(model, mjx.com_pos(model, kinematics(model, data)))
+    data = mjx.crb(model, mjx.tendon(model, data))
+    data = mjx.factor_m(model, mjx.tendon_armature(model, data))
+    data = mjx.make_constraint(model, mjx.collision(model, data))
+    return mjx.transmission(model, data)
 
 
 def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:

@@ -24,7 +24,7 @@ from mjx_drax.bounds import LogBarrier, Projection, Reflection, Sides
 from mjx_drax.constraints import Eliminated, eliminate, recover
 from mjx_drax.derivatives import Autodiff, Differentiator
 from mjx_drax.linearize import Linearization, linearize
-from mjx_drax.problem import Problem, Stagewise, Trajectory
+from mjx_drax.problem import Problem, Stagewise, Trajectory, Values
 from mjx_drax.riccati import QuadraticCost, White, newton
 
 Bounds = LogBarrier | Projection | Reflection
@@ -88,10 +88,14 @@ class Memoryless:
 
 def residuals(problem: Problem, trajectory: Trajectory) -> tuple[Array, Stagewise]:
     """h: the defects (K, ndx), and the constraints [equality; inequality + slack]."""
-    values = problem.constraints(trajectory)
-    if trajectory.slack is not None:
-        values = problem.with_slack(values, trajectory.slack)
-    return problem.defects(trajectory), values
+    constraints = problem.constraints(trajectory)
+    return problem.defects(trajectory), _with_slack(problem, trajectory, constraints)
+
+
+def _with_slack(problem: Problem, trajectory: Trajectory, constraints: Stagewise) -> Stagewise:
+    """[equality; inequality + slack], if the trajectory has slack variables."""
+    slack = trajectory.slack
+    return constraints if slack is None else problem.with_slack(constraints, slack)
 
 
 def augmented_lagrangian(
@@ -100,30 +104,35 @@ def augmented_lagrangian(
     trajectory: Trajectory,
     multipliers: Multipliers,
     levels: Levels,
+    values: Values | None = None,
 ) -> Array:
     """L_mu = c + rho b + lambda'h + mu/2 |h|^2 as one term per stage, (K + 1,).
 
     Two trajectories are compared by summing the differences of their terms, which keeps far more
-    digits in float32 than the difference of their sums.
+    digits in float32 than the difference of their sums. A caller that knows the trajectory's values
+    gives them.
     """
     walls = levels.barrier * bounds.value(problem.bounds, trajectory)
-    return jnp.append(walls, 0.0) + _penalized(problem, trajectory, multipliers, levels)
+    values = problem.values(trajectory) if values is None else values
+    return jnp.append(walls, 0.0) + _penalized(problem, trajectory, values, multipliers, levels)
 
 
 def _penalized(
-    problem: Problem, trajectory: Trajectory, multipliers: Multipliers, levels: Levels
+    problem: Problem,
+    trajectory: Trajectory,
+    values: Values,
+    multipliers: Multipliers,
+    levels: Levels,
 ) -> Array:
     """c + lambda'h + mu/2 |h|^2 as one term per stage, (K + 1,)."""
 
     def penalty(multiplier: Array, h: Array) -> Array:
         return jnp.sum(multiplier * h + 0.5 * levels.penalty * jnp.square(h), axis=-1)
 
-    h, values = residuals(problem, trajectory)
-    running = jax.vmap(problem.running_cost)(problem.stages(trajectory), trajectory.u)
-    running = running + penalty(multipliers.dynamics, h)
-    running = running + penalty(multipliers.constraints.stage, values.stage)
-    terminal = problem.terminal_cost(trajectory.x[-1])
-    terminal = terminal + penalty(multipliers.constraints.terminal, values.terminal)
+    h = _with_slack(problem, trajectory, values.constraints)
+    running = values.costs[:-1] + penalty(multipliers.dynamics, values.defects)
+    running = running + penalty(multipliers.constraints.stage, h.stage)
+    terminal = values.costs[-1] + penalty(multipliers.constraints.terminal, h.terminal)
     return jnp.append(running, terminal)
 
 
@@ -157,7 +166,8 @@ class Identity(Memoryless):
 
             def merit(change: Trajectory) -> Array:
                 moved = displaced(problem, trajectory, change)
-                return jnp.sum(_penalized(problem, moved, multipliers, levels))
+                values = problem.values(moved)
+                return jnp.sum(_penalized(problem, moved, values, multipliers, levels))
 
             slope = jax.grad(merit)(at_rest(problem, trajectory))
         else:
@@ -232,7 +242,7 @@ class Model:
 def expand(problem: Problem, trajectory: Trajectory, by: Differentiator, key: Array) -> Model:
     """Differentiate dynamics, costs and constraints at every knot."""
     dynamics = problem.dynamics
-    ndx, nu, by = dynamics.ndx, dynamics.nu, dynamics.differentiator(by)
+    ndx, nu, given, by = dynamics.ndx, dynamics.nu, by, dynamics.differentiator(by)
     keys = jax.random.split(key, problem.horizon + 1)
 
     def stage(x: Array, u: Array, key: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -255,7 +265,7 @@ def expand(problem: Problem, trajectory: Trajectory, by: Differentiator, key: Ar
     if trajectory.slack is not None:
         residual = problem.with_slack(residual, trajectory.slack)
     return Model(
-        dynamics=linearize(problem, trajectory, by, keys[:-1]),
+        dynamics=linearize(problem, trajectory, given, keys[:-1]),
         cost=QuadraticCost(
             jnp.concatenate([g[:, :ndx], g_end[None]]),
             g[:, ndx:],
@@ -365,7 +375,7 @@ class GaussNewton(Memoryless):
 
     ladder = (1.0, 1 / 2, 1 / 4, 1 / 16, 0.0)
     derivatives: Differentiator = field(default_factory=Autodiff)
-    light: ArrayLike = 0.01
+    light: ArrayLike = 0.001
 
     def direction(
         self,

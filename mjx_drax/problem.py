@@ -64,6 +64,27 @@ class Trajectory:
 
 @register_dataclass
 @dataclass(frozen=True)
+class Values:
+    """What the functions of a problem are at a trajectory.
+
+    Attributes:
+        costs: l(x_k, u_k) and phi(x_K), (K + 1,).
+        defects: h_k, (K, ndx).
+        constraints: [equality; inequality], without slack variables.
+    """
+
+    costs: Array
+    defects: Array
+    constraints: Stagewise
+
+    @property
+    def cost(self) -> Array:
+        """phi(x_K) + sum_k l(x_k, u_k), scalar."""
+        return jnp.sum(self.costs[:-1]) + self.costs[-1]
+
+
+@register_dataclass
+@dataclass(frozen=True)
 class Box:
     """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free."""
 
@@ -275,10 +296,15 @@ class Problem:
         """x_0..x_{K-1} (K, nx): the states that the controls act on."""
         return self.with_start(trajectory)[:-1]
 
+    def costs(self, trajectory: Trajectory) -> Array:
+        """l(x_k, u_k) and phi(x_K), (K + 1,)."""
+        running = jax.vmap(self.running_cost)(self.stages(trajectory), trajectory.u)
+        return jnp.append(running, self.terminal_cost(trajectory.x[-1]))
+
     def cost(self, trajectory: Trajectory) -> Array:
         """phi(x_K) + sum_k l(x_k, u_k), scalar."""
-        running = jax.vmap(self.running_cost)(self.stages(trajectory), trajectory.u)
-        return jnp.sum(running) + self.terminal_cost(trajectory.x[-1])
+        costs = self.costs(trajectory)
+        return jnp.sum(costs[:-1]) + costs[-1]
 
     def defects(self, trajectory: Trajectory) -> Array:
         """h_k = f(x_k, u_k) - x_{k+1} in the tangent space at x_{k+1}, (K, ndx)."""
@@ -300,14 +326,22 @@ class Problem:
             self.terminal_constraint.with_slack(values.terminal, slack.terminal),
         )
 
+    def values(self, trajectory: Trajectory) -> Values:
+        """All of them at once."""
+        return Values(
+            self.costs(trajectory), self.defects(trajectory), self.constraints(trajectory)
+        )
+
     def max_defect(self, trajectory: Trajectory) -> Array:
         """max|h| over dynamics and constraints (inequalities count where positive), scalar."""
-        values = self.constraints(trajectory)
-        defect = jnp.abs(self.defects(trajectory)).max(initial=0.0)
-        stage = self.constraint.violation(values.stage)
-        return jnp.maximum(
-            defect, jnp.maximum(stage, self.terminal_constraint.violation(values.terminal))
-        )
+        return self.worst(self.values(trajectory))
+
+    def worst(self, values: Values) -> Array:
+        """max|h| of values that are known, scalar."""
+        defect = jnp.abs(values.defects).max(initial=0.0)
+        stage = self.constraint.violation(values.constraints.stage)
+        end = self.terminal_constraint.violation(values.constraints.terminal)
+        return jnp.maximum(defect, jnp.maximum(stage, end))
 
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.

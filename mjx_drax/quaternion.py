@@ -70,3 +70,14 @@ def normalized(q: Array) -> Array:
     identity = jnp.zeros_like(q).at[..., 0].set(1.0)
     null = square == 0.0
     return jnp.where(null, identity, q / jnp.sqrt(jnp.where(null, 1.0, square)))
+
+
+def matrix(q: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of unit quaternions q (..., 4)."""
+    w, x, y, z = (q[..., i] for i in range(4))
+    rows = (
+        (w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

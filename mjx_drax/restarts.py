@@ -46,9 +46,9 @@ from mjx_drax.langevin import (
     Langevin,
     Scale,
     State,
-    advance,
-    evaluate,
+    advance_and_evaluate,
     ranking,
+    undiagnosed,
 )
 from mjx_drax.problem import Problem, Trajectory, functions_of, numbers
 from mjx_drax.recording import LIMIT, Recorder, knot_defects
@@ -292,7 +292,6 @@ class _Search:
         first = solver.first(unit)
         before, answered = self._resumed(first)
         if not answered:
-            jax.block_until_ready(self._advanced(first, state, 0, 0, int(flow.tail) > 0))
             if solver.attempts > 1:
                 _gather((state, info), (state, info), everyone)
             if self.recorder is not None:
@@ -368,7 +367,8 @@ class _Search:
 
         def start() -> tuple[State, Info]:
             x, u = (jnp.zeros((*shape, n), dtype) for n in (nx, nu))
-            return _init(flow, problem, Trajectory(x, u), jax.random.key(0))
+            state = _init(flow, problem, Trajectory(x, u), jax.random.key(0))
+            return state, undiagnosed(state)
 
         def size(tree: Any) -> int:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
@@ -404,6 +404,8 @@ class _Search:
         self.stand = replace(saved["stand"], records=tuple(records), began=began)
         if self.recorder is not None:
             self.recorder.restore(saved["recorder"])
+        if not saved["ended"]:
+            jax.block_until_ready(self._advanced(flow, state, 0, 0, tail))  # just compiles
         return saved["solve_time"], saved["ended"]
 
     def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:
@@ -433,7 +435,11 @@ class _Search:
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
         if attempt == 0 and not hasattr(self.problem.dynamics, "mj_model"):
             _require_sound(flow, self.problem, knots)  # takes long for models: when they fail
-        return jax.block_until_ready(_init(flow, self.problem, knots, key_noise))
+        state = _init(flow, self.problem, knots, key_noise)
+        if self.checkpoint is not None and self.checkpoint.found is not None and attempt == 0:
+            return state, undiagnosed(state)  # it will be replaced; an answer needs no compiling
+        _, info = self._advanced(flow, state, 0, 0, int(flow.tail) > 0)
+        return jax.block_until_ready((state, info))
 
     def _mended(self, flow: Langevin, expected: int) -> bool:
         """Lead the attempt's chains on along replays where f has kinks; False if interrupted.
@@ -562,19 +568,14 @@ def _advance(
     stop: ArrayLike,
     tail: bool,
 ) -> tuple[State, Info]:
-    """`advance` and `evaluate` in one launch."""
-    state = advance(flow, problem, state, start, stop, tail)
-    return state, evaluate(problem, state.trajectory)
+    """`advance_and_evaluate`, of chains first."""
+    return advance_and_evaluate(flow, problem, state, start, stop, tail)
 
 
 _moved_to = jax.jit(Langevin.moved_to)
 
 
-@jax.jit
-def _init(flow: Langevin, problem: Problem, knots: Trajectory, key: Array) -> tuple[State, Info]:
-    """`Langevin.init` and `evaluate` in one launch."""
-    state = flow.init(problem, knots, key)
-    return state, evaluate(problem, state.trajectory)
+_init = jax.jit(Langevin.init)
 
 
 def _scale(cost: float, noise: float) -> Scale:
