@@ -230,7 +230,7 @@ class Langevin:
         """The noise that an iteration, from 0, adds; 0 in the tail."""
         if iteration >= self.iterations:
             return 0.0
-        return float(self.levels(iteration / max(self.iterations - 1, 1)).noise)
+        return float(_levels(self, iteration / max(self.iterations - 1, 1)).noise)
 
     def levels(self, t: ArrayLike) -> Levels:
         """The schedules' values at progress t in [0, 2]."""
@@ -475,6 +475,9 @@ class Langevin:
     def _moved(self, problem: Problem, old: Trajectory, change: Trajectory) -> Trajectory:
         """The knots `old` moved along a tangent `change`, kept inside the bounds."""
         return self.bounds.confine(problem.bounds, old, displaced(problem, old, change))
+
+
+_levels = jax.jit(Langevin.levels)
 
 
 _POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}

@@ -683,9 +683,8 @@ def _bounds(
     u_lower[limited], u_upper[limited] = model.actuator_ctrlrange[limited].T
     given = box(dynamics.nx, model.nu, x_bounds, u_bounds)
     turning = np.flatnonzero(Joints.of(model).is_quaternion)
-    if np.isfinite(given.x_lower[..., turning]).any() or (
-        np.isfinite(given.x_upper[..., turning]).any()
-    ):
+    ends = np.asarray(given.x_lower), np.asarray(given.x_upper)
+    if any(np.isfinite(end[..., turning]).any() for end in ends):
         raise DraxError(
             f"x_bounds are finite at entries {turning.tolist()}, which are quaternions: leave them "
             "infinite, and bound orientations by an inequality."

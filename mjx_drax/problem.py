@@ -665,6 +665,7 @@ def scatter_box(
     nx, nu = x_init.shape[0], bounds.u_lower.shape[-1]
     given = box(nx, nu, x, u)
 
+    @jax.jit
     def ends(
         asked: tuple[Array, Array], bound: tuple[Array, Array], middle: Array, reach: Array
     ) -> tuple[Array, Array]:

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax._mujoco import mujoco
@@ -60,8 +59,10 @@ def twin(
     except (NotImplementedError, ValueError) as error:
         raise DraxError(_refusal(mended, str(error))) from error
     # MJX commits its arrays to a device. What is computed from them is then committed as well, and
-    # a loop that is fed its own output would be compiled a second time.
-    return _with_springs(jax.tree.map(lambda a: jnp.asarray(np.asarray(a)), on_device))
+    # a loop that is fed its own output would be compiled a second time. (`asarray` would compile a
+    # program for every shape.)
+    placed: mjx.Model = jax.device_put(_with_springs(jax.tree.map(np.asarray, on_device)))
+    return placed
 
 
 def _with_nearest(model: mjx.Model, contacts: bool | int) -> mjx.Model:
@@ -91,8 +92,8 @@ def _with_springs(model: mjx.Model) -> mjx.Model:
     stiffness either. Now it is longer, by the last digit.
     """
     lower, upper = model.tendon_lengthspring.T
-    upper = jnp.where(lower == upper, jnp.nextafter(upper, -jnp.inf), upper)
-    return model.replace(tendon_lengthspring=jnp.stack([lower, upper], axis=1))
+    upper = np.where(lower == upper, np.nextafter(upper, upper.dtype.type(-np.inf)), upper)
+    return model.replace(tendon_lengthspring=np.stack([lower, upper], axis=1))
 
 
 def _mend(model: mujoco.MjModel) -> None:
