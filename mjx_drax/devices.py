@@ -7,8 +7,8 @@ gathered in every process.
 
 Chains exchange nothing and each has its own random key, so answers need not depend on the shares.
 For XLA to round alike too, every device runs the program of a single device on its share: programs
-that `jax.shard_map` makes of the same functions are simplified in another order, take up to four
-times as long to compile on a GPU, and end the process (jax 0.11) where an array holds no numbers.
+that `jax.shard_map` makes of the same functions are simplified in another order, and end the process
+(jax 0.11) where an array holds no numbers.
 """
 
 from __future__ import annotations
@@ -110,10 +110,15 @@ def gathered(tree: Tree, mesh: Mesh | None) -> Tree:
 
 def _share(leaf: Any, mesh: Mesh, device: jax.Device) -> Array:
     """What that device works on, there."""
-    if isinstance(leaf, Array) and leaf.sharding == NamedSharding(mesh, P("share")):
+    if _is_split(leaf, mesh):
         return next(shard.data for shard in leaf.addressable_shards if shard.device == device)
     count, index = len(leaf) // mesh.size, list(mesh.devices.flat).index(device)
     return jax.device_put(leaf[index * count : (index + 1) * count], device)
+
+
+def _is_split(leaf: Any, mesh: Mesh) -> bool:
+    split = NamedSharding(mesh, P("share"))
+    return isinstance(leaf, Array) and leaf.sharding.is_equivalent_to(split, leaf.ndim)
 
 
 def _joined(shares: tuple[Array, ...], mesh: Mesh) -> Array:
@@ -125,6 +130,8 @@ def _joined(shares: tuple[Array, ...], mesh: Mesh) -> Array:
 
 def _gathered(mesh: Mesh, leaf: Array) -> Array:
     """All rows of an array, on the first device of this process."""
+    if not _is_split(leaf, mesh):
+        return leaf
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         data = _gathered(mesh, jax.random.key_data(leaf))
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))

@@ -313,6 +313,8 @@ class _Search:
                 raise
         if not answered:
             self._save(ended, now=True)
+        if jax.process_count() > 1:  # of a state that is split, the others hold a part
+            kept = self._whole(kept)
         records, began = list(self.stand.records), list(self.stand.began)
         times = compile_time, time.perf_counter() - self.clock
         return Run(kept.state, kept.info, kept.converged_at, records, began, *times)

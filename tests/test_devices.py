@@ -83,13 +83,14 @@ from mjx_drax.models import path
 from_mjcf(path("pendulum"), horizon=0.2, running_residual=lambda data, u: u)  # on own devices
 solver = Restarts(replace(Restarts().flow, iterations=8, tail=4), descent=4, attempts=2)
 found = solve(problem, 4, 0, solver)
+once = solve(problem, 4, 0, replace(solver, attempts=1))
 starts = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
 many = solve_batch(lambda x: replace(problem, x_init=x), starts, 2, 0, solver)
 if port != "alone":
     for count, options, words in ((3, {}, "2 processes"), (4, {"checkpoint": "x"}, "one file")):
         with pytest.raises(DraxError, match=words):
             solve(problem, count, 0, solver, **options)
-np.savez(out, u=found.trajectories.u, x=found.trajectories.x, cost=found.cost,
+np.savez(out, once=once.trajectories.u, u=found.trajectories.u, x=found.trajectories.x, cost=found.cost,
          ends=found.feedback.states, many=many.u, costs=many.cost)
 """.replace("PROBLEM", PROBLEM)  # jax.distributed comes before anything else of JAX
 
