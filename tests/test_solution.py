@@ -259,11 +259,11 @@ def test_ctrl_c_during_an_iteration_reports_the_numbers_of_the_chains_it_returns
 
     advance_ = restarts._advance
 
-    def interrupted(*arguments):
+    def interrupted(*arguments, **options):
         calls.append(None)  # the first only compiles
         if len(calls) == call:
             raise KeyboardInterrupt
-        return advance_(*arguments)
+        return advance_(*arguments, **options)
 
     monkeypatch.setattr(restarts, "_advance", interrupted)
     solution = solve(reach(), chains=3, solver=QUICK)
