@@ -7,8 +7,8 @@ gathered in every process.
 
 Chains exchange nothing and each has its own random key, so answers need not depend on the shares.
 For XLA to round alike too, every device runs the program of a single device on its share: programs
-that `jax.shard_map` makes of the same functions are simplified in another order, and end the process
-(jax 0.11) where an array holds no numbers.
+that `jax.shard_map` makes of the same functions are simplified in another order, and end the
+process (jax 0.11) where an array holds no numbers.
 """
 
 from __future__ import annotations
