@@ -90,8 +90,8 @@ if port != "alone":
     for count, options, words in ((3, {}, "2 processes"), (4, {"checkpoint": "x"}, "one file")):
         with pytest.raises(DraxError, match=words):
             solve(problem, count, 0, solver, **options)
-np.savez(out, once=once.trajectories.u, u=found.trajectories.u, x=found.trajectories.x, cost=found.cost,
-         ends=found.feedback.states, many=many.u, costs=many.cost)
+np.savez(out, u=found.trajectories.u, x=found.trajectories.x, cost=found.cost,
+         once=once.trajectories.u, ends=found.feedback.states, many=many.u, costs=many.cost)
 """.replace("PROBLEM", PROBLEM)  # jax.distributed comes before anything else of JAX
 
 
