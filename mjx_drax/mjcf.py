@@ -602,7 +602,7 @@ def require_movable(model: mujoco.MjModel, name: str) -> None:
 def initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
     """x_0 (nx,) as given, or the first keyframe, or the default pose at rest."""
     if x_init is not None:
-        x0 = np.asarray(vector("x_init", x_init), float)
+        x0 = np.array(vector("x_init", x_init), float)  # a copy: it will be scaled
     elif model.nkey:
         x0 = np.concatenate([model.key_qpos[0], model.key_qvel[0], model.key_act[0]])
     else:

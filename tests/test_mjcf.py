@@ -310,6 +310,8 @@ def test_quaternions_of_x_init_have_length_1():
     x[2:6] = [0.6, 0.0, 0.8001, 0.0]
     seen = problem(arm(world=BALL), x_init=x).x_init
     assert np.linalg.norm(seen[2:6]) == pytest.approx(1.0, abs=1e-6)
+    with jax.enable_x64(True):  # where nothing is copied for its precision
+        np.testing.assert_allclose(problem(arm(world=BALL), x_init=x).x_init, seen, rtol=1e-6)
 
 
 def fails(data, *u):
