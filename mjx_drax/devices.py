@@ -117,15 +117,20 @@ def _share(leaf: Any, mesh: Mesh, device: jax.Device) -> Array:
 
 
 def _is_split(leaf: Any, mesh: Mesh) -> bool:
-    split = NamedSharding(mesh, P("share"))
-    return isinstance(leaf, Array) and leaf.sharding.is_equivalent_to(split, leaf.ndim)
+    """Whether the rows of an array are spread over the mesh already."""
+    return isinstance(leaf, Array) and leaf.sharding.is_equivalent_to(_by_rows(mesh), leaf.ndim)
+
+
+def _by_rows(mesh: Mesh) -> NamedSharding:
+    """Rows split over the mesh, in its order."""
+    return NamedSharding(mesh, P("share"))
 
 
 def _joined(shares: tuple[Array, ...], mesh: Mesh) -> Array:
     """One array, from the shares of this process' devices in the order of the mesh."""
     rows, *shape = shares[0].shape
-    split = NamedSharding(mesh, P("share"))
-    return jax.make_array_from_single_device_arrays((rows * mesh.size, *shape), split, shares)
+    whole = rows * mesh.size, *shape
+    return jax.make_array_from_single_device_arrays(whole, _by_rows(mesh), shares)
 
 
 def _gathered(mesh: Mesh, leaf: Array) -> Array:

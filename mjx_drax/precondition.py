@@ -262,8 +262,7 @@ def expand(problem: Problem, trajectory: Trajectory, by: Differentiator, key: Ar
     g_end, H_end = problem.terminal.expand(end, ndx, by, keys[-1])
     J_end, values_end = by.jacobian(lambda dx: problem.terminal_constraint(*end(dx)), ndx, keys[-1])
     residual = Stagewise(values, values_end)
-    if trajectory.slack is not None:
-        residual = problem.with_slack(residual, trajectory.slack)
+    residual = _with_slack(problem, trajectory, residual)
     return Model(
         dynamics=linearize(problem, trajectory, given, keys[:-1]),
         cost=QuadraticCost(

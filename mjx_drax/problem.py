@@ -80,7 +80,12 @@ class Values:
     @property
     def cost(self) -> Array:
         """phi(x_K) + sum_k l(x_k, u_k), scalar."""
-        return jnp.sum(self.costs[:-1]) + self.costs[-1]
+        return _total(self.costs)
+
+
+def _total(costs: Array) -> Array:
+    """The sum of l(x_k, u_k) and phi(x_K), (K + 1,)."""
+    return jnp.sum(costs[:-1]) + costs[-1]
 
 
 @register_dataclass
@@ -303,8 +308,7 @@ class Problem:
 
     def cost(self, trajectory: Trajectory) -> Array:
         """phi(x_K) + sum_k l(x_k, u_k), scalar."""
-        costs = self.costs(trajectory)
-        return jnp.sum(costs[:-1]) + costs[-1]
+        return _total(self.costs(trajectory))
 
     def defects(self, trajectory: Trajectory) -> Array:
         """h_k = f(x_k, u_k) - x_{k+1} in the tangent space at x_{k+1}, (K, ndx)."""

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, Trajectory, from_function
 from mjx_drax.dynamics import FunctionDynamics
-from mjx_drax.langevin import advance, evaluate
+from mjx_drax.langevin import advance, advance_and_evaluate, evaluate
 from mjx_drax.problem import box
 
 K, NX, NU = 4, 2, 1
@@ -133,6 +133,24 @@ def test_states_are_damped_less_where_f_has_kinks():
         np.testing.assert_allclose(z(advance(solver, task, state, 0, 1))[0], expected, rtol=1e-9)
         compiled.append(advance._cache_size())
     assert compiled[0] == compiled[1]
+
+
+@pytest.mark.parametrize("noisy", [0, 2])
+def test_one_loop_advances_and_evaluates_as_two_calls_do(noisy):
+    problem = program()
+    f = problem.dynamics
+    kinked = replace(problem, dynamics=Kinked(f.function, f.dt, f.nx, f.nu))
+    solver = Langevin(iterations=noisy, tail=4)
+    state = start(solver, kinked)
+    for first, last in ((0, 0), (0, 3), (0, 4 + noisy)):
+        moved, info = advance_and_evaluate(solver, kinked, state, first, last)
+        expected = advance(solver, kinked, state, first, last)
+        np.testing.assert_allclose(z(moved), z(expected), rtol=1e-12)
+        np.testing.assert_allclose(moved.damping, expected.damping)
+        wanted = evaluate(kinked, expected.trajectory)
+        np.testing.assert_allclose(info.cost, wanted.cost, rtol=1e-12)
+        np.testing.assert_allclose(info.max_defect, wanted.max_defect, rtol=1e-6, atol=1e-12)
+    assert info.max_defect.max() > 0.0
 
 
 MU = 2.0
