@@ -414,11 +414,12 @@ class _Search:
 
         launch = spread(share, self.mesh, flow, some)
 
-        def flowed(iterations: int) -> tuple[Trajectory, Array, Info]:
-            return gathered(launch((np.arange(self.size), *rows), iterations), self.mesh)
+        def flowed(iterations: int, compiles: bool = False) -> tuple[Trajectory, Array, Info]:
+            found = launch((np.arange(self.size), *rows), iterations, compiles=compiles)
+            return gathered(found, self.mesh)
 
         if not self.compile_time:
-            jax.block_until_ready(flowed(0))
+            jax.block_until_ready(flowed(0, compiles=True))
             self.compile_time = time.perf_counter() - clock
         found = flowed(total)
         self._keep(indices[:count], *jax.tree.map(lambda a: np.asarray(a)[:count], found))

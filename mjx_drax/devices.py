@@ -83,13 +83,15 @@ def spread(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Calla
         whole: trees that every device gets a copy of.
 
     Returns:
-        a function whose results are split over the mesh, as its rows may be already.
+        a function whose results are split over the mesh, as its rows may be already. In a
+        launch that `compiles`, devices take turns if the first one's program serves the others.
     """
     if mesh is None:
-        return lambda rows, *numbers: program(rows, *whole, *numbers)
+        return lambda rows, *numbers, compiles=False: program(rows, *whole, *numbers)
     copies = {device: jax.device_put(whole, device) for device in mesh.local_devices}
 
-    def launch(rows: Any, *numbers: Any) -> Any:
+    def launch(rows: Any, *numbers: Any, compiles: bool = False) -> Any:
+        in_turn = compiles and _cached()
         wide = jnp.result_type(float) == jnp.float64
 
         def work(device: jax.Device) -> Any:
@@ -97,10 +99,16 @@ def spread(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Calla
                 mine = jax.tree.map(lambda leaf: _share(leaf, mesh, device), rows)
                 return program(mine, *copies[device], *numbers)
 
-        with ThreadPoolExecutor(len(copies)) as pool:
+        with ThreadPoolExecutor(1 if in_turn else len(copies)) as pool:
             return jax.tree.map(lambda *shares: _joined(shares, mesh), *pool.map(work, copies))
 
     return launch
+
+
+def _cached() -> bool:
+    """Whether devices find in JAX's persistent cache what another one compiled: GPUs do."""
+    kept = jax.config.values["jax_compilation_cache_dir"] is not None
+    return kept and jax.default_backend() == "gpu"  # keys of CPUs' programs hold the device
 
 
 def gathered(tree: Tree, mesh: Mesh | None) -> Tree:

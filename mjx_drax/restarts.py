@@ -552,7 +552,7 @@ class _Search:
         if self.launch is None or self.launch[0] is not flow or self.launch[1] != tail:
             program = spread(partial(_advance, tail=tail), self.mesh, flow, self.problem)
             self.launch = flow, tail, program
-        state, info = self.launch[2](state, start, stop)
+        state, info = self.launch[2](state, start, stop, compiles=start == stop == 0)
         return state, gathered(info, self.mesh)
 
     def _stride(self, total: int) -> int:

@@ -25,8 +25,9 @@ problem = from_function(
 """
 
 PROGRAM = """
-import sys
+import sys, time
 import jax
+from mjx_drax import devices
 
 assert len(jax.devices()) == 8
 solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, attempts=2)
@@ -54,6 +55,22 @@ alone, many = (
     for n in (1, 2)
 )
 np.testing.assert_array_equal(many.u, alone.u)
+
+def overlap(compiles):
+    # How many devices work at a time.
+    busy, most = [], []
+    def program(rows):
+        busy.append(rows)
+        time.sleep(0.2)
+        most.append(len(busy))
+        busy.pop()
+        return rows
+    devices.spread(program, devices.mesh_for(8, 4))(jnp.zeros(8), compiles=compiles)
+    return max(most)
+
+assert overlap(False) == overlap(True) == 4
+devices._cached = lambda: True  # as on GPUs: the others find what the first one compiled
+assert overlap(False) == 4 and overlap(True) == 1
 print("same", spread.solve_time)
 """
 
