@@ -33,8 +33,8 @@ def make(horizon: float = 1.2) -> Problem:
 
 
 def effort(data: Any, u: Array) -> Array:
-    """Half its squared norm is dt (|u - q|^2 + |v|^2 / 100), u - q what servos push with."""
-    parts = [u - data.qpos[7:], 0.1 * data.qvel]
+    """Half its squared norm is dt (|u - q|^2 + |v|^2 / 11), u - q what servos push with."""
+    parts = [u - data.qpos[7:], 0.3 * data.qvel]
     return np.sqrt(2 * DT) * jnp.concatenate(parts)
 
 
