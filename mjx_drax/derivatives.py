@@ -71,11 +71,11 @@ class InScalars:
 
     def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
         """Jacobian (m, n) and value (m,)."""
-        return scalarized(lambda: self.by.jacobian(function, size, key))()
+        return scalarized(lambda: self.by.jacobian(function, size, key), outermost=True)()
 
     def hessian(self, function: Function, size: int) -> Array:
         """Hessian (n, n)."""
-        return scalarized(lambda: self.by.hessian(function, size))()
+        return scalarized(lambda: self.by.hessian(function, size), outermost=True)()
 
 
 @register_dataclass

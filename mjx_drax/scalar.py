@@ -44,21 +44,24 @@ class Unsupported(Exception):
     """A function that cannot, or should not, be scalarized."""
 
 
-def scalarized(function: Callable[..., Any], limit: int = LIMIT) -> Callable[..., Any]:
+def scalarized(
+    function: Callable[..., Any], limit: int = LIMIT, outermost: bool = False
+) -> Callable[..., Any]:
     """The same function of pytrees of arrays, in scalar arithmetic where that is possible.
 
     With more than `limit` operations (each entry of a traced array that is read counts as one) it
     stays as it is. Arrays that the function closes over and that are not traced are known numbers,
     whose zeros and ones are used. Arguments are not. Functions with their own derivative rule
     (custom_jvp, custom_vjp) are not opened, because the result may be differentiated:
-    differentiate first.
+    differentiate first. If it is `outermost`, which nobody differentiates, GPUs compute it for all
+    rows of a batch by one kernel.
     """
 
     @wraps(function)
     def in_scalars(*arguments: Any) -> Any:
         closed, flat, tree = _traced(function, arguments)
         try:
-            outputs = _Evaluation(limit).outputs(closed, flat)
+            outputs = (_in_kernel if outermost and _on_gpu() else _in_loops)(limit, closed, flat)
         except (Unsupported, TypeError):  # types: as in `pruned`
             outputs = _in_arrays(closed, flat)
         return jax.tree.unflatten(tree, outputs)
@@ -68,6 +71,45 @@ def scalarized(function: Callable[..., Any], limit: int = LIMIT) -> Callable[...
 
 def _in_arrays(closed: ClosedJaxpr, flat: Sequence[Any]) -> list[Any]:
     return jaxpr_as_fun(closed)(*flat)
+
+
+def _in_loops(limit: int, closed: ClosedJaxpr, flat: Sequence[Any]) -> list[Any]:
+    """In operations that XLA fuses."""
+    return [_joined(v) for v in _Evaluation(limit).outputs(closed, closed.consts, flat)]
+
+
+def _on_gpu() -> bool:
+    return jax.default_backend() == "gpu"
+
+
+def _in_kernel(limit: int, closed: ClosedJaxpr, flat: Sequence[Any]) -> list[Any]:
+    """In operations that one kernel applies to all rows of a batch."""
+    numbers = [*closed.consts, *flat]
+    traced = [isinstance(number, jax.core.Tracer) for number in numbers]
+    inputs = [number for number, is_traced in zip(numbers, traced, strict=True) if is_traced]
+
+    def in_scalars(*entries: Scalar) -> list[Scalar]:
+        left, values = iter(entries), list(numbers)
+        for i, number in enumerate(numbers):
+            if traced[i]:
+                values[i] = _array([next(left) for _ in range(number.size)], number.shape)
+        consts, arguments = values[: len(closed.consts)], values[len(closed.consts) :]
+        outputs = _Evaluation(limit).outputs(closed, consts, arguments)
+        return [scalar for output in outputs for scalar in _flat(output)]
+
+    dtype, entries = np.dtype(np.float32), sum(number.size for number in inputs)
+    avals: list[Any] = [*(number.aval for number in inputs), *closed.out_avals]
+    if not inputs or any(a.dtype != dtype for a in avals) or entries > limit:
+        return _in_loops(limit, closed, flat)
+    program = jax.make_jaxpr(in_scalars)(*[jax.ShapeDtypeStruct((), dtype)] * entries)
+    if not all(equation.primitive.name in _IN_KERNELS for equation in program.eqns):
+        return _in_loops(limit, closed, flat)
+    from mjx_drax.scalar_kernel import by_rows  # only here: importing Pallas takes a second
+
+    shapes = [aval.shape for aval in closed.out_avals]
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = lax.split(by_rows(program)(*inputs), sizes)
+    return [lax.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def pruned(function: Function) -> Function:
@@ -112,11 +154,12 @@ class _Evaluation:
         self.negated: dict[int, Scalar] = {}  # id of -x: x
         self.entries: dict[int, np.ndarray] = {}  # id of an array: its scalars
 
-    def outputs(self, closed: ClosedJaxpr, arguments: Sequence[Any]) -> list[Any]:
-        """The jaxpr's outputs as JAX arrays."""
+    def outputs(
+        self, closed: ClosedJaxpr, consts: Sequence[Any], arguments: Sequence[Any]
+    ) -> list[np.ndarray]:
+        """The entries of the jaxpr's outputs."""
         needed = [True] * len(closed.jaxpr.outvars)
-        values = self.run(closed.jaxpr, closed.consts, arguments, needed)
-        return [_joined(self.split(value)) for value in values]
+        return [self.split(value) for value in self.run(closed.jaxpr, consts, arguments, needed)]
 
     def run(
         self, jaxpr: Jaxpr, consts: Sequence[Any], arguments: Sequence[Any], needed: Sequence[bool]
@@ -428,6 +471,10 @@ _ELEMENTWISE = {
     *("log1p", "logistic", "nextafter", "one_minus_square", "pow", "reduce_precision", "round"),
     *("rsqrt", "sinh"),
 }
+_IN_KERNELS = _ELEMENTWISE - {
+    *("copy", "copy_p", "erf", "one_minus_square", "reduce_precision", "round")
+}
+"""Those that Pallas lowers for GPUs."""
 
 
 # The parameters that lax gives to the operations which are bound here: versions of JAX differ

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from mjx_drax import from_mjcf, mjcf, scalar
+from mjx_drax import from_mjcf, mjcf, scalar, scalar_kernel
 from mjx_drax.derivatives import Autodiff, InScalars
 from mjx_drax.models import path
 from mjx_drax.scalar import pruned, scalarized
@@ -218,6 +218,67 @@ def test_keys_pass_through():
         return jax.random.normal(key, (2,)) + x
 
     close(scalarized(f)(jax.random.key(0), 1.0), f(jax.random.key(0), 1.0), 0)
+
+
+def pulled(x, y, z):
+    """Some arithmetic whose entries share most of what they are made of."""
+    lean = jnp.sin(x[0] * y) + z[1] * jnp.where(x[1] > 1.0, x[1], jnp.exp(z[0]))
+    return {"out": jnp.stack([jnp.outer(lean, x), jnp.ones((2, 2))]), "sum": lean.sum() / z[1]}
+
+
+@pytest.mark.parametrize("outer", [(0, 0, None), (None, 0, None), (None, None, 0)])
+@pytest.mark.parametrize("inner", [(0, None, None), (0, 0, 0)])
+def test_rows_of_a_batch_are_those_of_single_calls(inner, outer, strictly, monkeypatch):
+    """As on a GPU, but for the kernel itself: any argument may be batched at any level."""
+    monkeypatch.setattr(scalar, "_on_gpu", lambda: True)
+    sizes = [[n for n, axes in ((4, outer), (3, inner)) if axes[i] == 0] for i in range(3)]
+    arguments = [RNG.uniform(0.5, 2.0, (*size, 2)).astype(np.float32) for size in sizes]
+
+    def over(function):
+        return jax.jit(jax.vmap(jax.vmap(function, inner), outer))(*arguments)
+
+    close(over(scalarized(pulled, outermost=True)), over(pulled), 1e-6)
+    single = [np.ones(2, np.float32)] * 3
+    assert "custom_vmap" in str(jax.make_jaxpr(scalarized(pulled, outermost=True))(*single))
+
+
+def program_of(function, *sizes):
+    """The function of the entries of arrays, as a kernel takes it."""
+
+    def of_entries(*entries):
+        ends = np.cumsum(sizes)
+        arrays = [jnp.stack(entries[e - n : e]) for n, e in zip(sizes, ends, strict=True)]
+        return [out[i] for out in [jnp.ravel(function(*arrays))] for i in range(out.size)]
+
+    return jax.make_jaxpr(scalarized(of_entries))(*[jnp.ones(())] * sum(sizes))
+
+
+def test_the_kernel_computes_every_row():
+    rows = scalar_kernel.THREADS + 5  # one block of threads, and another that is not full
+    x, y, z = (RNG.uniform(0.5, 2.0, n).astype(np.float32) for n in ((rows, 2), 2, 2))
+
+    def function(z, x, y):
+        return pulled(x, y, z)["out"]
+
+    batched = (False, True, False)
+    program = program_of(function, 2, 2, 2)
+    seen = scalar_kernel.over_rows(program, batched, z, x, y, interpret=True)
+    wanted = jax.vmap(function, (None, 0, None))(z, x, y)
+    np.testing.assert_allclose(seen, wanted.reshape(rows, -1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(scalar._IN_KERNELS))
+def test_kernels_hold_only_what_pallas_lowers(name):
+    from jax._src.pallas.triton.lowering import triton_lowering_rules
+
+    assert name in {str(primitive) for primitive in triton_lowering_rules}
+
+
+@pytest.mark.parametrize("function", [jnp.round, jax.scipy.special.erf, lambda x: x.astype(int)])
+def test_what_kernels_lack_stays_in_loops(function, strictly, monkeypatch):
+    monkeypatch.setattr(scalar, "_on_gpu", lambda: True)
+    x = jnp.asarray(A, jnp.float32)
+    close(jax.jit(jax.vmap(scalarized(function, outermost=True)))(x), function(x), 1e-6)
 
 
 EVERYTHING = """
