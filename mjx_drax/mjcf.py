@@ -5,9 +5,8 @@ The same model is stepped by MuJoCo's C engine, in float64, when a result is cer
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,9 @@ from mjx_drax import agreement, physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, Differentiator, InScalars
 from mjx_drax.dynamics import Dynamics
-from mjx_drax.errors import DraxError, cut, require_part, require_positive, shown
+from mjx_drax.errors import DraxError, cut, reason, require_part, require_positive, shown
 from mjx_drax.functions import require_functions
-from mjx_drax.host import difference, set_state
+from mjx_drax.host import difference, quiet, set_state
 from mjx_drax.joints import Joints
 from mjx_drax.physics import mjx
 from mjx_drax.problem import (
@@ -44,12 +43,15 @@ from mjx_drax.problem import (
 )
 from mjx_drax.scalar import scalarized
 from mjx_drax.source import Source, is_xml
-from mjx_drax.twin import driven, free_ranges, has_constraints, nearest_only, twin
+from mjx_drax.twin import disabled, driven, free_ranges, has_constraints, nearest_only, twin
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
 take several times as many, and compilers need minutes for tens of thousands."""
 
+
+SINGULAR = 1e-10
+"""Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. To wait for each other at every knot costs threads more than a few
@@ -259,7 +261,7 @@ class MjxDynamics(Dynamics):
         now, sound = np.tile(start, (chains, 1)), np.ones(chains, bool)
         now[:, x] = plan[:, 0]
         steps = np.empty((chains, self.substeps, len(start)))
-        with _no_log_file(), Rollout(nthread=threads if threads > 1 else 0) as engine:
+        with quiet(), Rollout(nthread=threads if threads > 1 else 0) as engine:
             for k in range(knots):
                 off = self._differences(states[:, k], plan[:, k])
                 wanted = u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off)
@@ -326,17 +328,6 @@ _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """What a step starts from: the time, the state, and what actuators and plugins remember."""
 
 
-@contextlib.contextmanager
-def _no_log_file() -> Iterator[None]:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT where the user stands when a replay blows up."""
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
-
-
 def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:
     return physics.forward(structure.imposed(model), x, u)
 
@@ -373,7 +364,7 @@ def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
 
 def _compiled(source: str | Path) -> mujoco.MjModel:
     try:
-        with _no_log_file():
+        with quiet():
             if is_xml(source):
                 return mujoco.MjModel.from_xml_string(source)
             if not Path(source).is_file():
@@ -390,9 +381,17 @@ def _compiled(source: str | Path) -> mujoco.MjModel:
         if isinstance(error, DraxError):
             raise
         words = " ".join(str(error).split())
+        fix = next((fix for part, fix in _FIXES.items() if part in words), "Correct the MJCF.")
         raise DraxError(
-            f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} Correct the MJCF."
+            f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} {fix}"
         ) from error
+
+
+_FIXES = {
+    "'mujocoinclude'": "It is a part that models include: give the model's own file.",
+    "Error opening file": "Put that file there, or correct the path, meshdir or texturedir.",
+}
+"""What to do about some of MuJoCo's complaints."""
 
 
 _GIVEN = ("body_", "dof_", "jnt_", "geom_", "tendon_", "actuator_", "eq_", "qpos_spring", "key_")
@@ -534,6 +533,7 @@ def from_mjcf(
     substeps = steps_between_knots(host, dt)
     K = knots(horizon, substeps * host.opt.timestep)
     x0 = initial_state(host, name, x_init)
+    require_regular(host, name, x0)
     bounded = bounded_joints(host, x0)
     dynamics = MjxDynamics(
         twin(host, contacts, bounded),
@@ -542,6 +542,7 @@ def from_mjcf(
         substeps,
         derivatives,
     )
+    require_traceable(name, dynamics.observe, host)
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
     agreement.require(host, name, x0, contacts, bounded)
     agreement.require_near(host, name, x0, nearest_only(dynamics.model), bounded)
@@ -597,6 +598,46 @@ def require_movable(model: mujoco.MjModel, name: str) -> None:
         raise DraxError(f"{name} has no joints: there is nothing to move; add a <joint>.")
     if model.nu == 0:
         raise DraxError(f"{name} has no actuators: add an <actuator>.")
+    if disabled(model).all():
+        raise DraxError(
+            f"all actuators of {name} are disabled: clear the flag actuation and "
+            "actuatorgroupdisable in <option>."
+        )
+
+
+def require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> None:
+    """Raise a DraxError for a model whose acceleration cannot be found at x_init (nx,)."""
+    data = mujoco.MjData(model)
+    set_state(model, data, x_init)
+    with quiet():
+        mujoco.mj_forward(model, data)
+    M = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    scale = np.sqrt(np.diag(M))
+    least, along = (part[..., 0] for part in np.linalg.eigh(M / np.outer(scale, scale)))
+    if not least > SINGULAR:
+        joints = model.dof_jntid[np.abs(along) > 0.5 * np.abs(along).max()]
+        names = ", ".join(str(model.joint(j).name or j) for j in dict.fromkeys(joints.tolist()))
+        raise DraxError(
+            f"the inertia of {name} is singular, because joints move bodies alike ({names}): leave "
+            'one of them out, or give them armature="0.01".'
+        )
+    if not np.isfinite(data.qacc).all():
+        raise DraxError(f"{name} has no finite acceleration at x_init: give another x_init.")
+
+
+def require_traceable(
+    name: str, forward: Callable[[Array, Array], Any], model: mujoco.MjModel
+) -> None:
+    """Raise a DraxError for a model that MJX takes, but fails in when it is to step it."""
+    x, u = jnp.zeros(model.nq + model.nv + model.na), jnp.zeros(model.nu)
+    try:
+        jax.eval_shape(forward, x, u)
+    except Exception as error:  # of any kind, deep inside MJX
+        raise DraxError(
+            f"MJX fails in a step of {name} ({reason(error)}): leave out sensors, tendons and "
+            "equality constraints, by which it may fail, until it does not."
+        ) from error
 
 
 def initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
