@@ -42,7 +42,7 @@ from mjx_drax.problem import (
     vector,
 )
 from mjx_drax.scalar import scalarized
-from mjx_drax.source import Source, is_xml
+from mjx_drax.source import Source, is_binary, is_xml
 from mjx_drax.twin import disabled, driven, free_ranges, has_constraints, nearest_only, twin
 
 STEP_LIMIT = 2_000
@@ -50,8 +50,12 @@ STEP_LIMIT = 2_000
 take several times as many, and compilers need minutes for tens of thousands."""
 
 
-SINGULAR = 1e-10
-"""Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
+SINGULAR, STIFF = 1e-10, 1e-2
+"""Least eigenvalues of the inertia, scaled to a diagonal of ones: that can be divided by, and, of
+that at x_init, over which knots are scattered: accelerations lose all measure at a gimbal lock."""
+
+TRIED = 256
+"""Random positions at which the inertia is looked at."""
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. To wait for each other at every knot costs threads more than a few
@@ -371,6 +375,8 @@ def _compiled(source: str | Path) -> mujoco.MjModel:
                 is_folder = Path(source).is_dir()
                 what = "it is a folder; give a file in it" if is_folder else "check the path"
                 raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
+            if is_binary(source):
+                return mujoco.MjModel.from_binary_path(str(source))
             return mujoco.MjModel.from_xml_path(str(source))
     except TypeError as error:
         raise DraxError(
@@ -389,6 +395,7 @@ def _compiled(source: str | Path) -> mujoco.MjModel:
 
 _FIXES = {
     "'mujocoinclude'": "It is a part that models include: give the model's own file.",
+    "Unrecognized XML model type": "Give an MJCF, which begins with <mujoco>, or a URDF.",
     "Error opening file": "Put that file there, or correct the path, meshdir or texturedir.",
 }
 """What to do about some of MuJoCo's complaints."""
@@ -491,8 +498,10 @@ def from_mjcf(
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
-            +-5 (rad/s or m/s) for velocities about x_init. Where contacts, limits or dry friction
-            act, chains start nearer to x_init, some more than others: see `Problem.draw`.
+            +-5 (rad/s or m/s) for velocities about x_init; half of that, or a quarter, and so on,
+            where joints would align so far from x_init that the inertia is singular. Where
+            contacts, limits or dry friction act, chains start nearer to x_init, some more than
+            others: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the
@@ -567,7 +576,7 @@ def from_mjcf(
 
 def _origin(model: str | Path | mujoco.MjModel) -> str | Path | None:
     """The XML that the user gave, or its file's absolute path."""
-    if isinstance(model, mujoco.MjModel):
+    if isinstance(model, mujoco.MjModel) or is_binary(model):
         return None
     return model if is_xml(model) else Path(model).resolve()
 
@@ -597,7 +606,7 @@ def require_movable(model: mujoco.MjModel, name: str) -> None:
     if model.nv == 0:
         raise DraxError(f"{name} has no joints: there is nothing to move; add a <joint>.")
     if model.nu == 0:
-        raise DraxError(f"{name} has no actuators: add an <actuator>.")
+        raise DraxError(f"{name} has no actuators: add an <actuator> (to MJCF: a URDF has none).")
     if disabled(model).all():
         raise DraxError(
             f"all actuators of {name} are disabled: clear the flag actuation and "
@@ -611,10 +620,7 @@ def require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> Non
     set_state(model, data, x_init)
     with quiet():
         mujoco.mj_forward(model, data)
-    M = np.empty((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, M)
-    scale = np.sqrt(np.diag(M))
-    least, along = (part[..., 0] for part in np.linalg.eigh(M / np.outer(scale, scale)))
+    least, along = _least_inertia(model, data)
     if not least > SINGULAR:
         joints = model.dof_jntid[np.abs(along) > 0.5 * np.abs(along).max()]
         names = ", ".join(str(model.joint(j).name or j) for j in dict.fromkeys(joints.tolist()))
@@ -624,6 +630,15 @@ def require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> Non
         )
     if not np.isfinite(data.qacc).all():
         raise DraxError(f"{name} has no finite acceleration at x_init: give another x_init.")
+
+
+def _least_inertia(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, np.ndarray]:
+    """Least eigenvalue of the inertia, scaled to a diagonal of ones, and its eigenvector (nv,)."""
+    M = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    scale = np.sqrt(np.diag(M))
+    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+    return float(values[0]), vectors[:, 0]
 
 
 def require_traceable(
@@ -691,8 +706,32 @@ def _scatter(
         hold = controls(model, np.stack([x_init, x_init]), dynamics.dt, middle(bounds))[0]
         hold = np.clip(hold, *ends)
         u = hold - width, hold + width
-    reach = jnp.asarray(_reach(model))
-    return scatter_box(bounds, jnp.asarray(x_init), reach, x, u)
+    reach, start = jnp.asarray(_reach(model)), jnp.asarray(x_init)
+    full = scatter_box(bounds, start, reach, x, u)
+    share = _share(model, x_init, full) if x is None else 1.0
+    ends = (start + share * (end - start) for end in (full.x_lower, full.x_upper))
+    return full if share == 1.0 else Box(*ends, full.u_lower, full.u_upper)
+
+
+def _share(model: mujoco.MjModel, x_init: np.ndarray, scatter: Box) -> float:
+    """The largest of 1, 1/2, ..., 1/32 of the scatter about x_init where the inertia is regular."""
+    data, rng, nq = mujoco.MjData(model), np.random.default_rng(0), model.nq
+    lower, upper = (
+        np.asarray(end, float).reshape(-1, len(x_init))[0, :nq]
+        for end in (scatter.x_lower, scatter.x_upper)
+    )
+    away = lower + rng.uniform(size=(TRIED, nq)) * (upper - lower) - x_init[:nq]
+
+    def least(qpos: np.ndarray) -> float:
+        data.qpos[:] = qpos
+        with quiet():
+            mujoco.mj_fwdPosition(model, data)
+        return _least_inertia(model, data)[0]
+
+    start = x_init[:nq]
+    enough = STIFF * least(start)
+    shares = (float(share) for share in 0.5 ** np.arange(5))
+    return next((s for s in shares if all(least(start + s * a) > enough for a in away)), 0.5**5)
 
 
 def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:

@@ -293,6 +293,7 @@ def test_contacts_can_be_left_out():
         (arm().replace("<option", '<option actuatorgroupdisable="0"'), "actuatorgroupdisable"),
         (TWICE, r"inertia of twins is singular, because joints .* \(one, 1\): leave"),
         ("<mujoco><worldbody><geom/></mujoco>", "MuJoCo cannot compile"),
+        ("<sdf/>", "cannot compile.*Give an MJCF, which begins with <mujoco>, or a URDF"),
         ("<mujocoinclude/>", "cannot compile.*a part that models include: give the model's own"),
         (arm(more='<asset><mesh file="hull.stl"/></asset>'), "'hull.stl' Put that file there, or"),
         ("<mujoco><worldbody><geom sise='1'/></worldbody></mujoco>", "(?s)cannot compile.*sise"),
@@ -301,6 +302,26 @@ def test_contacts_can_be_left_out():
 def test_models_that_are_refused(model, words):
     with pytest.raises(DraxError, match=words):
         problem(model)
+
+
+def test_models_may_come_compiled(tmp_path):
+    file = tmp_path / "arm.mjb"
+    mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(arm()), str(file), None)
+    assert problem(file).name == "arm"
+    file.write_bytes(b"none")
+    with pytest.raises(DraxError, match="MuJoCo cannot compile"):
+        problem(file)
+
+
+def test_knots_are_scattered_where_no_joints_align():
+    gimbal = "".join(f'<joint axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    bob = f'<body>{gimbal}<inertial pos="0 0 -0.5" mass="1" diaginertia="1 1 1"/></body>'
+    scatter = problem(arm(world=bob)).scatter
+    turns = np.asarray(scatter.x_upper)[2:5]
+    np.testing.assert_allclose(turns, turns[0])
+    assert turns[0] < np.pi / 2
+    wide = problem(arm(world=bob), x_scatter=(-3, 3)).scatter
+    np.testing.assert_allclose(np.asarray(wide.x_upper)[2:5], 3)
 
 
 def test_a_singular_inertia_is_reported_once(tmp_path, monkeypatch, capfd):
