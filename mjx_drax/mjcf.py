@@ -709,8 +709,10 @@ def _scatter(
     reach, start = jnp.asarray(_reach(model)), jnp.asarray(x_init)
     full = scatter_box(bounds, start, reach, x, u)
     share = _share(model, x_init, full) if x is None else 1.0
-    ends = (start + share * (end - start) for end in (full.x_lower, full.x_upper))
-    return full if share == 1.0 else Box(*ends, full.u_lower, full.u_upper)
+    if share == 1.0:
+        return full
+    lower, upper = (start + share * (end - start) for end in (full.x_lower, full.x_upper))
+    return Box(lower, upper, full.u_lower, full.u_upper)
 
 
 def _share(model: mujoco.MjModel, x_init: np.ndarray, scatter: Box) -> float:
