@@ -270,6 +270,13 @@ CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equa
             },
             "contacts like that of 'floor' with 'tip'",
         ),
+        (
+            {
+                "before": '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>',
+                "more": '<worldbody><geom type="hfield" hfield="h" pos="0 0 -5"/></worldbody>',
+            },
+            "contacts like that of 'geom 1 of body world' with 'link'",
+        ),
     ],
 )
 def test_differences_have_a_sentence_each(parts, words):
