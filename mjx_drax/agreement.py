@@ -68,14 +68,16 @@ class Engine:
         model, data = self.model, mujoco.MjData(self.model)
         host.set_state(model, data, x)
         data.ctrl[:] = u
-        mujoco.mj_step(model, data, steps)
+        with host.quiet():
+            mujoco.mj_step(model, data, steps)
         return np.concatenate([data.qpos, data.qvel, data.act])
 
     def touching(self, x: np.ndarray) -> int:
         """Contacts that act at x (nx,), of the friction dimension that has the most."""
         data = mujoco.MjData(self.model)
         host.set_state(self.model, data, x)
-        mujoco.mj_forward(self.model, data)
+        with host.quiet():
+            mujoco.mj_forward(self.model, data)
         acting = data.contact.dim[data.contact.efc_address >= 0]
         return int(np.bincount(acting, minlength=1).max())
 

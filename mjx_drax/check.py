@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mjx_drax import physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.agreement import WRONG, Engine, compare, probes
 from mjx_drax.errors import DraxError
@@ -17,6 +19,8 @@ from mjx_drax.mjcf import (
     load,
     model_name,
     require_movable,
+    require_regular,
+    require_traceable,
     steps_between_knots,
 )
 from mjx_drax.twin import (
@@ -79,6 +83,7 @@ def check(
     try:
         require_movable(model, name)
         x_init = initial_state(model, name, None)
+        require_regular(model, name, x_init)
         bounded = bounded_joints(model, x_init)
         report["joints"] = _joints(model, bounded)
         planned = twin(model, bounded=bounded)
@@ -89,6 +94,7 @@ def check(
             "nearest": nearest_only(planned),
         }
         progress(f"{name}: compiling one step of MJX and its derivatives ...")
+        require_traceable(name, partial(physics.forward, planned), model)
         report["agreement"] = _agreement(model, x_init, bounded)
         error = report["agreement"]["velocity_error"]
         if not error <= WRONG:

@@ -6,12 +6,26 @@ quaternions in their own frame. `joints` is the same arithmetic in JAX.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 
 from mjx_drax._mujoco import mujoco
 
 Floats = npt.NDArray[np.floating]
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep MuJoCo from printing warnings, and from writing MUJOCO_LOG.TXT where the user stands."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
 
 
 def finite(states: Floats) -> Floats:

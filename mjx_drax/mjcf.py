@@ -5,9 +5,8 @@ The same model is stepped by MuJoCo's C engine, in float64, when a result is cer
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,9 @@ from mjx_drax import agreement, physics
 from mjx_drax._mujoco import mujoco
 from mjx_drax.derivatives import Autodiff, Differentiator, InScalars
 from mjx_drax.dynamics import Dynamics
-from mjx_drax.errors import DraxError, cut, require_part, require_positive, shown
+from mjx_drax.errors import DraxError, cut, reason, require_part, require_positive, shown
 from mjx_drax.functions import require_functions
-from mjx_drax.host import difference, set_state
+from mjx_drax.host import difference, quiet, set_state
 from mjx_drax.joints import Joints
 from mjx_drax.physics import mjx
 from mjx_drax.problem import (
@@ -43,13 +42,20 @@ from mjx_drax.problem import (
     vector,
 )
 from mjx_drax.scalar import scalarized
-from mjx_drax.source import Source, is_xml
-from mjx_drax.twin import driven, free_ranges, has_constraints, nearest_only, twin
+from mjx_drax.source import Source, is_binary, is_xml
+from mjx_drax.twin import disabled, driven, free_ranges, has_constraints, nearest_only, twin
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
 take several times as many, and compilers need minutes for tens of thousands."""
 
+
+SINGULAR, STIFF = 1e-10, 1e-2
+"""Least eigenvalues of the inertia, scaled to a diagonal of ones: that can be divided by, and, of
+that at x_init, over which knots are scattered: accelerations lose all measure at a gimbal lock."""
+
+TRIED = 256
+"""Random positions at which the inertia is looked at."""
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. To wait for each other at every knot costs threads more than a few
@@ -259,7 +265,7 @@ class MjxDynamics(Dynamics):
         now, sound = np.tile(start, (chains, 1)), np.ones(chains, bool)
         now[:, x] = plan[:, 0]
         steps = np.empty((chains, self.substeps, len(start)))
-        with _no_log_file(), Rollout(nthread=threads if threads > 1 else 0) as engine:
+        with quiet(), Rollout(nthread=threads if threads > 1 else 0) as engine:
             for k in range(knots):
                 off = self._differences(states[:, k], plan[:, k])
                 wanted = u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off)
@@ -326,17 +332,6 @@ _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """What a step starts from: the time, the state, and what actuators and plugins remember."""
 
 
-@contextlib.contextmanager
-def _no_log_file() -> Iterator[None]:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT where the user stands when a replay blows up."""
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
-
-
 def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:
     return physics.forward(structure.imposed(model), x, u)
 
@@ -373,13 +368,15 @@ def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
 
 def _compiled(source: str | Path) -> mujoco.MjModel:
     try:
-        with _no_log_file():
+        with quiet():
             if is_xml(source):
                 return mujoco.MjModel.from_xml_string(source)
             if not Path(source).is_file():
                 is_folder = Path(source).is_dir()
                 what = "it is a folder; give a file in it" if is_folder else "check the path"
                 raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
+            if is_binary(source):
+                return mujoco.MjModel.from_binary_path(str(source))
             return mujoco.MjModel.from_xml_path(str(source))
     except TypeError as error:
         raise DraxError(
@@ -390,9 +387,18 @@ def _compiled(source: str | Path) -> mujoco.MjModel:
         if isinstance(error, DraxError):
             raise
         words = " ".join(str(error).split())
+        fix = next((fix for part, fix in _FIXES.items() if part in words), "Correct the MJCF.")
         raise DraxError(
-            f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} Correct the MJCF."
+            f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} {fix}"
         ) from error
+
+
+_FIXES = {
+    "'mujocoinclude'": "It is a part that models include: give the model's own file.",
+    "Unrecognized XML model type": "Give an MJCF, which begins with <mujoco>, or a URDF.",
+    "Error opening file": "Put that file there, or correct the path, meshdir or texturedir.",
+}
+"""What to do about some of MuJoCo's complaints."""
 
 
 _GIVEN = ("body_", "dof_", "jnt_", "geom_", "tendon_", "actuator_", "eq_", "qpos_spring", "key_")
@@ -492,8 +498,10 @@ def from_mjcf(
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
-            +-5 (rad/s or m/s) for velocities about x_init. Where contacts, limits or dry friction
-            act, chains start nearer to x_init, some more than others: see `Problem.draw`.
+            +-5 (rad/s or m/s) for velocities about x_init; half of that, or a quarter, and so on,
+            where joints would align so far from x_init that the inertia is singular. Where
+            contacts, limits or dry friction act, chains start nearer to x_init, some more than
+            others: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the
@@ -534,6 +542,7 @@ def from_mjcf(
     substeps = steps_between_knots(host, dt)
     K = knots(horizon, substeps * host.opt.timestep)
     x0 = initial_state(host, name, x_init)
+    require_regular(host, name, x0)
     bounded = bounded_joints(host, x0)
     dynamics = MjxDynamics(
         twin(host, contacts, bounded),
@@ -542,6 +551,7 @@ def from_mjcf(
         substeps,
         derivatives,
     )
+    require_traceable(name, dynamics.observe, host)
     bounds = _bounds(host, bounded, dynamics, x_bounds, u_bounds)
     agreement.require(host, name, x0, contacts, bounded)
     agreement.require_near(host, name, x0, nearest_only(dynamics.model), bounded)
@@ -566,7 +576,7 @@ def from_mjcf(
 
 def _origin(model: str | Path | mujoco.MjModel) -> str | Path | None:
     """The XML that the user gave, or its file's absolute path."""
-    if isinstance(model, mujoco.MjModel):
+    if isinstance(model, mujoco.MjModel) or is_binary(model):
         return None
     return model if is_xml(model) else Path(model).resolve()
 
@@ -596,7 +606,53 @@ def require_movable(model: mujoco.MjModel, name: str) -> None:
     if model.nv == 0:
         raise DraxError(f"{name} has no joints: there is nothing to move; add a <joint>.")
     if model.nu == 0:
-        raise DraxError(f"{name} has no actuators: add an <actuator>.")
+        raise DraxError(f"{name} has no actuators: add an <actuator> (to MJCF: a URDF has none).")
+    if disabled(model).all():
+        raise DraxError(
+            f"all actuators of {name} are disabled: clear the flag actuation and "
+            "actuatorgroupdisable in <option>."
+        )
+
+
+def require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> None:
+    """Raise a DraxError for a model whose acceleration cannot be found at x_init (nx,)."""
+    data = mujoco.MjData(model)
+    set_state(model, data, x_init)
+    with quiet():
+        mujoco.mj_forward(model, data)
+    least, along = _least_inertia(model, data)
+    if not least > SINGULAR:
+        joints = model.dof_jntid[np.abs(along) > 0.5 * np.abs(along).max()]
+        names = ", ".join(str(model.joint(j).name or j) for j in dict.fromkeys(joints.tolist()))
+        raise DraxError(
+            f"the inertia of {name} is singular, because joints move bodies alike ({names}): leave "
+            'one of them out, or give them armature="0.01".'
+        )
+    if not np.isfinite(data.qacc).all():
+        raise DraxError(f"{name} has no finite acceleration at x_init: give another x_init.")
+
+
+def _least_inertia(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, np.ndarray]:
+    """Least eigenvalue of the inertia, scaled to a diagonal of ones, and its eigenvector (nv,)."""
+    M = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    scale = np.sqrt(np.diag(M))
+    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+    return float(values[0]), vectors[:, 0]
+
+
+def require_traceable(
+    name: str, forward: Callable[[Array, Array], Any], model: mujoco.MjModel
+) -> None:
+    """Raise a DraxError for a model that MJX takes, but fails in when it is to step it."""
+    x, u = jnp.zeros(model.nq + model.nv + model.na), jnp.zeros(model.nu)
+    try:
+        jax.eval_shape(forward, x, u)
+    except Exception as error:  # of any kind, deep inside MJX
+        raise DraxError(
+            f"MJX fails in a step of {name} ({reason(error)}): leave out sensors, tendons and "
+            "equality constraints, by which it may fail, until it does not."
+        ) from error
 
 
 def initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
@@ -650,8 +706,34 @@ def _scatter(
         hold = controls(model, np.stack([x_init, x_init]), dynamics.dt, middle(bounds))[0]
         hold = np.clip(hold, *ends)
         u = hold - width, hold + width
-    reach = jnp.asarray(_reach(model))
-    return scatter_box(bounds, jnp.asarray(x_init), reach, x, u)
+    reach, start = jnp.asarray(_reach(model)), jnp.asarray(x_init)
+    full = scatter_box(bounds, start, reach, x, u)
+    share = _share(model, x_init, full) if x is None else 1.0
+    if share == 1.0:
+        return full
+    lower, upper = (start + share * (end - start) for end in (full.x_lower, full.x_upper))
+    return Box(lower, upper, full.u_lower, full.u_upper)
+
+
+def _share(model: mujoco.MjModel, x_init: np.ndarray, scatter: Box) -> float:
+    """The largest of 1, 1/2, ..., 1/32 of the scatter about x_init where the inertia is regular."""
+    data, rng, nq = mujoco.MjData(model), np.random.default_rng(0), model.nq
+    lower, upper = (
+        np.asarray(end, float).reshape(-1, len(x_init))[0, :nq]
+        for end in (scatter.x_lower, scatter.x_upper)
+    )
+    away = lower + rng.uniform(size=(TRIED, nq)) * (upper - lower) - x_init[:nq]
+
+    def least(qpos: np.ndarray) -> float:
+        data.qpos[:] = qpos
+        with quiet():
+            mujoco.mj_fwdPosition(model, data)
+        return _least_inertia(model, data)[0]
+
+    start = x_init[:nq]
+    enough = STIFF * least(start)
+    shares = (float(share) for share in 0.5 ** np.arange(5))
+    return next((s for s in shares if all(least(start + s * a) > enough for a in away)), 0.5**5)
 
 
 def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:

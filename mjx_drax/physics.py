@@ -1,6 +1,6 @@
 """One step of MJX, with derivatives that hold at rest and in contact.
 
-Three things differ from `mjx.step`, none of them in value:
+Four things differ from `mjx.step`, the first three not in value:
 
 - Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), whose law s is MJX's. Newton's method
@@ -10,6 +10,7 @@ Three things differ from `mjx.step`, none of them in value:
   semi-implicit integrators end with this, so only the end is replaced; Runge-Kutta integrates at
   every stage and is written out.
 - The forces of springs on ball and free joints go through the same quaternions.
+- Boxes on planes have the contacts of the C engine; see `collision`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from jax import Array
 from mjx_drax._mjx import Context
 from mjx_drax._mjx import mjx as mjx
 from mjx_drax._mujoco import mujoco
+from mjx_drax.collision import collision
 from mjx_drax.joints import Joints
 from mjx_drax.linalg import cholesky, solve, symmetric
 from mjx_drax.tree import kinematics
@@ -76,7 +78,7 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.camlight(model, mjx.com_pos(model, kinematics(model, data)))
     data = mjx.crb(model, mjx.tendon(model, data))
     data = mjx.factor_m(model, mjx.tendon_armature(model, data))
-    data = mjx.make_constraint(model, mjx.collision(model, data))
+    data = mjx.make_constraint(model, collision(model, data))
     return mjx.transmission(model, data)
 
 

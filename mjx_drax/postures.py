@@ -21,6 +21,7 @@ from mjx_drax.mjcf import (
     load,
     model_name,
     require_movable,
+    require_regular,
     steps_between_knots,
 )
 from mjx_drax.problem import Problem
@@ -59,6 +60,7 @@ def reach(
     dt = steps * model.opt.timestep
     limits = control_ranges(model)
     x_init = initial_state(model, name, None)
+    require_regular(model, name, x_init)
     path = _motion(model, name, x_init, limits, steps, max(SHORTEST, round(horizon / dt)), seed)
     target = path[-1, : model.nq]
     on = Terms(model)

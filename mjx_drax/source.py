@@ -80,6 +80,11 @@ def is_xml(given: object) -> bool:
     return isinstance(given, str) and given.lstrip().startswith("<")
 
 
+def is_binary(given: object) -> bool:
+    """Whether a model is given as the path of a file that MuJoCo has compiled, .mjb."""
+    return not is_xml(given) and Path(str(given)).suffix.lower() == ".mjb"
+
+
 def binary(model: mujoco.MjModel) -> bytes:
     """The compiled model, as only the same version of MuJoCo reads it."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)

@@ -15,12 +15,17 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_drax._mjx import geom_pairs, has_collision_fn
 from mjx_drax._mujoco import mujoco
 from mjx_drax.errors import DraxError, shown
+from mjx_drax.host import quiet
 from mjx_drax.physics import mjx
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
+_TOUCHED = (mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT)
+_NET_FORCE = 3
+"""How contact sensors say reduce="netforce"."""
 
 NEAREST = 32
 """Contact points of each friction dimension (condim) that a plan keeps, if it is not told how many:
@@ -58,6 +63,8 @@ def twin(
         on_device = _with_nearest(on_device, contacts)
     except (NotImplementedError, ValueError) as error:
         raise DraxError(_refusal(mended, str(error))) from error
+    if not model.nmat:  # MJX's rangefinders look up materials, whether there are any or not
+        on_device = on_device.replace(mat_rgba=np.ones((1, 4), np.float32))
     # MJX commits its arrays to a device. What is computed from them is then committed as well, and
     # a loop that is fed its own output would be compiled a second time. (`asarray` would compile a
     # program for every shape.)
@@ -118,28 +125,47 @@ def _mend(model: mujoco.MjModel) -> None:
         # Otherwise MJX refuses what it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
-        touch = model.sensor_type == int(mujoco.mjtSensor.mjSENS_TOUCH)
+    touching = next(geom_pairs(model), None) is not None
+    if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
+        # Nothing has a friction cone, and MJX fails where there are no elliptic ones
+        opt.cone = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    if not touching:  # MJX looks for contacts, and finds no array of them
+        touch = np.isin(model.sensor_type, [int(kind) for kind in _TOUCHED])
         model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
-    silent = np.array([bool(opt.disableactuator >> g & 1) for g in model.actuator_group], bool)
-    model.actuator_gainprm[silent] = 0.0
-    model.actuator_biasprm[silent] = 0.0
-    unknown = np.array([int(s) not in _SENSORS for s in model.sensor_type], bool)
-    model.sensor_type[unknown] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # `differences` names them
+    model.actuator_gainprm[disabled(model)] = 0.0
+    model.actuator_biasprm[disabled(model)] = 0.0
+    # `differences` names them
+    model.sensor_type[_unknown_sensors(model)] = int(mujoco.mjtSensor.mjSENS_CLOCK)
+
+
+def disabled(model: mujoco.MjModel) -> np.ndarray:
+    """Actuators that are switched off, by their group or all, (nu,)."""
+    if model.opt.disableflags & _DISABLE.mjDSBL_ACTUATION:
+        return np.ones(model.nu, bool)
+    groups, off = model.actuator_group, int(model.opt.disableactuator)
+    return np.array([0 <= g < 31 and bool(off >> int(g) & 1) for g in groups], bool)
+
+
+def _unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
+    """Sensors that MJX does not compute, (nsensor,)."""
+    unknown = np.array([int(kind) not in _SENSORS for kind in model.sensor_type], bool)
+    between = np.stack([model.sensor_objtype, model.sensor_reftype], axis=1)
+    body = (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+    refused = np.isin(between, [int(kind) for kind in body]).any(axis=1)
+    refused |= model.sensor_intprm[:, 1] == _NET_FORCE
+    return unknown | refused & (model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
 
 
 def _refusal(model: mujoco.MjModel, reason: str) -> str:
     """What MJX said, with the elements that it means and what to do about them."""
     if "collisions not implemented" in reason or "margin/gap" in reason:
-        for a, b in contact_pairs(model):
-            kinds = [f"{_GEOM(model.geom_type[g])!s}" for g in (a, b)]
-            if all(kind.split(".")[-1] in reason for kind in kinds):
-                return (
-                    f"MJX cannot collide geoms {geom_name(model, a)!r} and {geom_name(model, b)!r} "
-                    f"({reason}): give them another type, no margin, or contype and conaffinity "
-                    "that keep them apart; or plan with contacts=False."
-                )
+        return _not_collided(model)
     if "condim" in reason.lower() or "ELLIPTIC" in reason:
         return f'{reason}: set <option cone="pyramidal"/>, or condim="3" on all geoms.'
+    if "fluid drag" in reason:
+        return (
+            f'{reason.rstrip(".")}: set <option integrator="Euler"/>, or no density and viscosity.'
+        )
     if "Flex" in reason:
         return "the model has flexible bodies (flex), which MJX does not simulate: remove them."
     for names, fix in (
@@ -154,10 +180,51 @@ def _refusal(model: mujoco.MjModel, reason: str) -> str:
     return f"MJX does not support this model: {reason}"
 
 
+def _not_collided(model: mujoco.MjModel) -> str:
+    """All that MJX cannot collide: of each two types of geoms one pair, and how many there are."""
+    types: dict[tuple[str, str], list[str]] = {}
+    margins: dict[tuple[str, str], list[str]] = {}
+    for a, b, pair in geom_pairs(model):
+        one, other = (_GEOM(model.geom_type[g]).name[len("mjGEOM_") :].lower() for g in (a, b))
+        margin = model.pair_margin[pair] if pair >= 0 else model.geom_margin[[a, b]].sum()
+        if not has_collision_fn(*model.geom_type[[a, b]]):
+            found = types
+        elif margin and {"mesh", "hfield"} & {one, other}:
+            found = margins
+        else:
+            continue
+        names = f"{geom_name(model, a)!r} and {geom_name(model, b)!r}"
+        found.setdefault((one, other), []).append(names)
+
+    def listed(found: dict[tuple[str, str], list[str]]) -> str:
+        counts = {
+            k: f", one of {len(v)} such pairs" if len(v) > 1 else "" for k, v in found.items()
+        }
+        return ", ".join(f"{v[0]} ({k[0]} with {k[1]}{counts[k]})" for k, v in found.items())
+
+    reasons = []
+    if types:
+        odd = sorted({kind for kinds in types for kind in kinds} & {"cylinder", "ellipsoid", "sdf"})
+        reasons.append(
+            f"cannot collide geoms {listed(types)}: make each {' and '.join(odd)} among them a "
+            "capsule, sphere, box or mesh"
+        )
+    if margins:
+        reasons.append(
+            "knows no margins of meshes and height fields, "
+            f'here of geoms {listed(margins)}: set margin="0" on both'
+        )
+    return (
+        f"MJX {', and '.join(reasons)}; or keep them apart by contype and conaffinity, or plan "
+        "with contacts=False."
+    )
+
+
 def geom_name(model: mujoco.MjModel, g: int) -> str:
     """A geom's name, or its number and body."""
     geom = model.geom(g)
-    return str(geom.name or f"geom {g} of body {model.body(int(geom.bodyid[0])).name}")
+    body = int(geom.bodyid[0])
+    return str(geom.name or f"geom {g} of body {model.body(body).name or body}")
 
 
 def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
@@ -183,14 +250,25 @@ def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
 _ROUGH = {
     frozenset(kinds)
     for kinds in (
+        (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_MESH),
         (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER),
         (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER),
         (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_CYLINDER),
         (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID),
+        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_ELLIPSOID),
+        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CAPSULE),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SPHERE),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_CAPSULE),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_BOX),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_MESH),
         (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_BOX),
     )
 }
-"""Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 0.7."""
+"""Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 1."""
 
 
 def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]:
@@ -235,11 +313,8 @@ def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]
         "connect and weld constraints pull a little differently: prefer joints",
     )
     note(model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box")
-    for i, kind in enumerate(model.sensor_type):
-        note(
-            int(kind) not in _SENSORS,
-            f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs",
-        )
+    for i in np.flatnonzero(_unknown_sensors(model)):
+        found.append(f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs")
     if contacts:
         for a, b in contact_pairs(model):
             kinds = frozenset((_GEOM(model.geom_type[a]), _GEOM(model.geom_type[b])))
@@ -267,9 +342,11 @@ def moments(model: mujoco.MjModel) -> np.ndarray:
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     largest = np.zeros((model.nu, model.nv))
     for _ in range(3):
-        mujoco.mj_forward(model, data)
+        with quiet():
+            mujoco.mj_forward(model, data)
         largest = np.maximum(largest, np.abs(moment_arms(model, data)))
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+    largest[disabled(model)] = 0.0
     return largest
 
 

@@ -1,5 +1,6 @@
 """Dynamics, bounds and initial states from MJCF, against MuJoCo's C engine; and what is refused."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -8,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Trajectory, from_mjcf
+from mjx_drax import DraxError, Trajectory, from_mjcf, physics
+from mjx_drax.check import check
 from mjx_drax.derivatives import Autodiff
 from mjx_drax.host import difference, set_state
 from mjx_drax.langevin import evaluate
@@ -236,6 +238,9 @@ COUPLED = '<equality><joint joint1="lift" joint2="wrist"/></equality>'
 STRING = (
     '<tendon><fixed limited="true" range="0 1"><joint joint="wrist" coef="1"/></fixed></tendon>'
 )
+TWICE = """<mujoco model="twins"><worldbody><body><joint name="one"/>
+  <joint/><geom size="1" pos="2 0 0"/></body></worldbody>
+  <actuator><motor joint="one"/></actuator></mujoco>"""
 STILL = '<mujoco model="rock"><worldbody><geom size="1"/></worldbody></mujoco>'
 
 
@@ -284,13 +289,57 @@ def test_contacts_can_be_left_out():
         (STILL, "rock has no joints"),
         ("nowhere.xml", "no model file 'nowhere.xml'"),
         (path("nowhere"), "no model file .*nowhere.xml"),
+        (arm().replace('contact="disable"', 'actuation="disable"'), "all actuators of arm are dis"),
+        (arm().replace("<option", '<option actuatorgroupdisable="0"'), "actuatorgroupdisable"),
+        (TWICE, r"inertia of twins is singular, because joints .* \(one, 1\): leave"),
         ("<mujoco><worldbody><geom/></mujoco>", "MuJoCo cannot compile"),
+        ("<sdf/>", "cannot compile.*Give an MJCF, which begins with <mujoco>, or a URDF"),
+        ("<mujocoinclude/>", "cannot compile.*a part that models include: give the model's own"),
+        (arm(more='<asset><mesh file="hull.stl"/></asset>'), "'hull.stl' Put that file there, or"),
         ("<mujoco><worldbody><geom sise='1'/></worldbody></mujoco>", "(?s)cannot compile.*sise"),
     ],
 )
 def test_models_that_are_refused(model, words):
     with pytest.raises(DraxError, match=words):
         problem(model)
+
+
+def test_models_may_come_compiled(tmp_path):
+    file = tmp_path / "arm.mjb"
+    mujoco.mj_saveModel(mujoco.MjModel.from_xml_string(arm()), str(file), None)
+    assert problem(file).name == "arm"
+    file.write_bytes(b"none")
+    with pytest.raises(DraxError, match="MuJoCo cannot compile"):
+        problem(file)
+
+
+def test_knots_are_scattered_where_no_joints_align():
+    gimbal = "".join(f'<joint axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    bob = f'<body>{gimbal}<inertial pos="0 0 -0.5" mass="1" diaginertia="1 1 1"/></body>'
+    scatter = problem(arm(world=bob)).scatter
+    turns = np.asarray(scatter.x_upper)[2:5]
+    np.testing.assert_allclose(turns, turns[0])
+    assert turns[0] < np.pi / 2
+    wide = problem(arm(world=bob), x_scatter=(-3, 3)).scatter
+    np.testing.assert_allclose(np.asarray(wide.x_upper)[2:5], 3)
+
+
+def test_a_singular_inertia_is_reported_once(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert check(TWICE)["obstacle"].startswith("the inertia of twins is singular")
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_mjx_fails_in_is_refused(monkeypatch):
+    def missing(*_):
+        raise TypeError("no gather")
+
+    monkeypatch.setattr(physics.mjx, "sensor_acc", missing)
+    words = r"MJX fails in a step of arm \(TypeError: no gather\): leave out sensors"
+    with pytest.raises(DraxError, match=words):
+        problem(arm(joint='damping="0.0123"'))
+    assert re.match(words, check(arm())["obstacle"])
 
 
 @pytest.mark.parametrize("side", [0, 1])

@@ -1,6 +1,9 @@
 """What becomes of a model that MJX does not know: mended, refused, or named among differences."""
 
+from functools import partial
+
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ import pytest
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.agreement import Probes, compare
 from mjx_drax.errors import DraxWarning
+from mjx_drax.physics import step
 from mjx_drax.twin import (
     NEAREST,
     constraint_rows,
@@ -111,6 +115,14 @@ def test_tendon_springs_have_stiffness_at_rest():
 
 
 MUSCLE = 'dyntype="user" joint="one"'
+TETRAHEDRON = "0 0 0 0.2 0 0 0 0.2 0 0 0 0.2"
+MESHES = "".join(
+    f'<body pos="{x} 3 3"><joint axis="0 1 0"/><geom name="{name}" type="mesh" mesh="m" '
+    'margin="0.01" contype="2" conaffinity="1"/></body>'
+    for x, name in ((3, "tip"), (6, "top"))
+)
+CYLINDER = '<body pos="9 0 0"><joint/><geom type="cylinder" size="1 1" contype="4"/></body>'
+APART = {"links": 'contype="0" conaffinity="0"'}
 
 
 @pytest.mark.parametrize(
@@ -118,7 +130,24 @@ MUSCLE = 'dyntype="user" joint="one"'
     [
         (
             {"floor": "box", "floors": 'pos="0 0 -1"', "link": "ellipsoid"},
-            r"cannot collide geoms 'floor' and 'link'.*contacts=False",
+            r"cannot collide geoms 'link' and 'floor' \(ellipsoid with box\): make each ellipsoid "
+            r"among them a .*contacts=False",
+        ),
+        (
+            {
+                "before": f'<asset><mesh name="m" vertex="{TETRAHEDRON}"/></asset>',
+                "link": "ellipsoid",
+                "floor": "box",
+                "floors": 'pos="0 0 -1"',
+                "more": f"<worldbody>{MESHES}{CYLINDER}</worldbody>",
+            },
+            r"'link' and 'floor' \(ellipsoid with box\), 'geom 5 of body 5' and 'floor' \(cylinder "
+            r"with box\),.* each cylinder and ellipsoid .*no margins.* 'floor' and 'tip' \(box "
+            r'with mesh, one of 2 such pairs\).* set margin="0"',
+        ),
+        (
+            {"option": 'integrator="implicit" density="1"', **APART},
+            'set <option integrator="Euler"',
         ),
         ({"option": 'cone="elliptic"', "links": 'condim="1"', "floors": 'condim="1"'}, "pyramidal"),
         (
@@ -135,7 +164,7 @@ MUSCLE = 'dyntype="user" joint="one"'
             "flex",
         ),
     ],
-    ids=["collision", "condim", "transmission", "dynamics", "flag", "flex"],
+    ids=["collision", "collisions", "fluid", "condim", "transmission", "dynamics", "flag", "flex"],
 )
 def test_what_is_refused_says_why_and_what_to_do(parts, words):
     with pytest.raises(DraxError, match=words):
@@ -190,6 +219,30 @@ def test_touch_sensors_feel_nothing_where_contacts_are_left_out():
     assert compare(model, STATES, contacts=False).velocity.max() < 1e-10
 
 
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"more": TOUCH.format('contact geom1="link" num="1" data="found force"')},
+        {"more": TOUCH.format('rangefinder site="tip"')},
+        {"option": 'cone="elliptic"', "joint": 'range="-20 20" limited="true"'},
+    ],
+    ids=["contact-sensor", "rangefinder", "elliptic"],
+)
+def test_what_mjx_fails_in_without_contacts_or_materials_is_stepped(parts):
+    on_device = twin(rigid(**parts))
+    end = jax.eval_shape(partial(step, on_device), jnp.zeros(4), jnp.zeros(2))
+    assert end.shape == (4,)
+
+
+@pytest.mark.parametrize(
+    "contact", ['body1="upper"', 'site="tip"', 'geom1="link" reduce="netforce" data="force"']
+)
+def test_contact_sensors_that_mjx_refuses_are_left_out(contact):
+    model = chain(more=TOUCH.format(f'contact name="odd" {contact}'))
+    assert differences(model) == ["sensor 'odd' is unknown to MJX: do not use it in costs"]
+    assert twin(model).nsensor == 1
+
+
 CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'
 
 
@@ -209,6 +262,21 @@ CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equa
         ({"option": 'density="1"', "links": 'fluidshape="ellipsoid"'}, "ellipsoid fluid"),
         ({"more": '<sensor><user name="odd" dim="1"/></sensor>'}, "sensor 'odd' is unknown"),
         ({"floor": "cylinder"}, "contacts like that of 'floor' with 'ball'|'link'"),
+        (
+            {
+                "before": f'<asset><mesh name="m" vertex="{TETRAHEDRON}"/></asset>',
+                "more": '<worldbody><body pos="3 0 3"><joint/><geom name="tip" type="mesh" '
+                'mesh="m" contype="2"/></body></worldbody>',
+            },
+            "contacts like that of 'floor' with 'tip'",
+        ),
+        (
+            {
+                "before": '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>',
+                "more": '<worldbody><geom type="hfield" hfield="h" pos="0 0 -5"/></worldbody>',
+            },
+            "contacts like that of 'geom 1 of body world' with 'link'",
+        ),
     ],
 )
 def test_differences_have_a_sentence_each(parts, words):
@@ -251,6 +319,9 @@ def test_contact_pairs_are_those_of_mujoco():
 def test_joints_that_are_driven():
     assert driven(rigid()).tolist() == [True, True]
     assert driven(rigid(motor='group="0"', joint='group="0"')).tolist() == [True, True]
+    off = 'actuatorgroupdisable="1"'  # as "weak" has
+    assert driven(rigid(option=off)).tolist() == [True, False]
+    assert driven(rigid(option=off, motor='group="-1"')).tolist() == [True, False]
 
 
 def test_models_that_step_too_differently_are_refused_or_warned_of():
