@@ -50,12 +50,12 @@ STEP_LIMIT = 2_000
 take several times as many, and compilers need minutes for tens of thousands."""
 
 
-SINGULAR, STIFF = 1e-10, 1e-2
-"""Least eigenvalues of the inertia, scaled to a diagonal of ones: that can be divided by, and, of
-that at x_init, over which knots are scattered: accelerations lose all measure at a gimbal lock."""
+SINGULAR = 1e-10
+"""Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
 
-TRIED = 256
-"""Random positions at which the inertia is looked at."""
+CLOSE = 0.03
+"""Least factor on the default scatter of initial knots. Within +-3 rad and full torques of where it
+stood, no chain of an arm of seven joints found the way to a posture; from nearer all did."""
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. To wait for each other at every knot costs threads more than a few
@@ -498,10 +498,9 @@ def from_mjcf(
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
-            +-5 (rad/s or m/s) for velocities about x_init; half of that, or a quarter, and so on,
-            where joints would align so far from x_init that the inertia is singular. Where
-            contacts, limits or dry friction act, chains start nearer to x_init, some more than
-            others: see `Problem.draw`.
+            +-5 (rad/s or m/s) for velocities about x_init. Chains start nearer to x_init, some more
+            than others (see `Problem.draw`); those of a box given here only where contacts, limits
+            or dry friction act or states hold quaternions.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the
@@ -558,6 +557,7 @@ def from_mjcf(
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
     )
+    given = x_scatter is not None and not dynamics.kinked and dynamics.nx == dynamics.ndx
     return checked(
         Problem(
             dynamics=dynamics,
@@ -570,6 +570,7 @@ def from_mjcf(
             scatter=_scatter(dynamics, bounds, x0, x_scatter, u_scatter),
             aside=Aside(goal, guess, name),
             horizon=K,
+            closest=1.0 if given else CLOSE,
         )
     )
 
@@ -706,34 +707,7 @@ def _scatter(
         hold = controls(model, np.stack([x_init, x_init]), dynamics.dt, middle(bounds))[0]
         hold = np.clip(hold, *ends)
         u = hold - width, hold + width
-    reach, start = jnp.asarray(_reach(model)), jnp.asarray(x_init)
-    full = scatter_box(bounds, start, reach, x, u)
-    share = _share(model, x_init, full) if x is None else 1.0
-    if share == 1.0:
-        return full
-    lower, upper = (start + share * (end - start) for end in (full.x_lower, full.x_upper))
-    return Box(lower, upper, full.u_lower, full.u_upper)
-
-
-def _share(model: mujoco.MjModel, x_init: np.ndarray, scatter: Box) -> float:
-    """The largest of 1, 1/2, ..., 1/32 of the scatter about x_init where the inertia is regular."""
-    data, rng, nq = mujoco.MjData(model), np.random.default_rng(0), model.nq
-    lower, upper = (
-        np.asarray(end, float).reshape(-1, len(x_init))[0, :nq]
-        for end in (scatter.x_lower, scatter.x_upper)
-    )
-    away = lower + rng.uniform(size=(TRIED, nq)) * (upper - lower) - x_init[:nq]
-
-    def least(qpos: np.ndarray) -> float:
-        data.qpos[:] = qpos
-        with quiet():
-            mujoco.mj_fwdPosition(model, data)
-        return _least_inertia(model, data)[0]
-
-    start = x_init[:nq]
-    enough = STIFF * least(start)
-    shares = (float(share) for share in 0.5 ** np.arange(5))
-    return next((s for s in shares if all(least(start + s * a) > enough for a in away)), 0.5**5)
+    return scatter_box(bounds, jnp.asarray(x_init), jnp.asarray(_reach(model)), x, u)
 
 
 def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:

@@ -35,9 +35,6 @@ from mjx_drax.scalar import pruned
 MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
-CLOSE = 0.03
-"""Smallest factor on the scatter of initial knots where f has kinks or states quaternions."""
-
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -234,6 +231,7 @@ class Problem:
         x_init: x_0, (nx,).
         bounds: the box that every knot must keep to.
         scatter: the box that initial knots are drawn from, uniformly.
+        closest: least factor by which the box is shrunk towards x_init for a chain; 1 for none.
         aside: goal, guess and name, which no compiled computation reads.
         horizon: K, number of control knots.
     """
@@ -248,6 +246,7 @@ class Problem:
     scatter: Box
     aside: Aside = field(metadata=Static)
     horizon: int = field(metadata=Static)
+    closest: ArrayLike = 1.0
 
     @property
     def goal(self) -> Callable[[Any], Any] | None:
@@ -350,10 +349,10 @@ class Problem:
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.
 
-        They are drawn from the scatter box. Where f has kinks, bodies overlap far from x_init and
-        forces lose all measure; what floats freely may tumble at any speed. There the box is shrunk
-        towards x_init and the middle of the controls, for each chain by another factor from `CLOSE`
-        to 1, uniform in its logarithm.
+        They are drawn from the scatter box, which for each chain is shrunk towards x_init and the
+        middle of the controls by another factor from `closest` to 1, uniform in its logarithm. Far
+        from x_init bodies overlap, joints lock, and forces lose all measure; near to it, motions
+        that lead far away are not found.
         """
         if self.guess is not None:
             knots = self.guess(key)
@@ -364,10 +363,9 @@ class Problem:
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         x = box.x_lower + x * (box.x_upper - box.x_lower)
         u = box.u_lower + u * (box.u_upper - box.u_lower)
-        if dynamics.kinked or dynamics.nx != dynamics.ndx:
-            share = CLOSE ** jax.random.uniform(jax.random.fold_in(key, 2))
-            middle = 0.5 * (box.u_lower + box.u_upper)
-            x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
+        share = jnp.asarray(self.closest) ** jax.random.uniform(jax.random.fold_in(key, 2))
+        middle = 0.5 * (box.u_lower + box.u_upper)
+        x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
         return Trajectory(dynamics.valid(x), u)
 
     def replay(
