@@ -53,10 +53,6 @@ take several times as many, and compilers need minutes for tens of thousands."""
 SINGULAR = 1e-10
 """Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
 
-CLOSE = 0.03
-"""Least factor on the default scatter of initial knots. Within +-3 rad and full torques of where it
-stood, no chain of an arm of seven joints found the way to a posture; from nearer all did."""
-
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. To wait for each other at every knot costs threads more than a few
 steps do: of 64 chains of a hopper on two cores, 64 threads took five times as long as one."""
@@ -557,7 +553,6 @@ def from_mjcf(
     constraint, terminal_constraint = constraints_of(
         dynamics, equality, inequality, terminal_equality, terminal_inequality
     )
-    given = x_scatter is not None and not dynamics.kinked and dynamics.nx == dynamics.ndx
     return checked(
         Problem(
             dynamics=dynamics,
@@ -570,7 +565,7 @@ def from_mjcf(
             scatter=_scatter(dynamics, bounds, x0, x_scatter, u_scatter),
             aside=Aside(goal, guess, name),
             horizon=K,
-            closest=1.0 if given else CLOSE,
+            near=x_scatter is None,
         )
     )
 

@@ -35,6 +35,10 @@ from mjx_drax.scalar import pruned
 MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
+CLOSE = 0.03
+"""Least factor on the scatter of initial knots. Within +-3 rad and full torques of where it stood,
+no chain of an arm of seven joints found the way to a posture; from nearer all did."""
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -231,9 +235,10 @@ class Problem:
         x_init: x_0, (nx,).
         bounds: the box that every knot must keep to.
         scatter: the box that initial knots are drawn from, uniformly.
-        closest: least factor by which the box is shrunk towards x_init for a chain; 1 for none.
         aside: goal, guess and name, which no compiled computation reads.
         horizon: K, number of control knots.
+        near: whether chains start nearer to x_init than the scatter; where f has kinks or states
+            hold quaternions they do anyway.
     """
 
     dynamics: Dynamics
@@ -246,7 +251,7 @@ class Problem:
     scatter: Box
     aside: Aside = field(metadata=Static)
     horizon: int = field(metadata=Static)
-    closest: ArrayLike = 1.0
+    near: bool = field(default=False, metadata=Static)
 
     @property
     def goal(self) -> Callable[[Any], Any] | None:
@@ -349,10 +354,10 @@ class Problem:
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.
 
-        They are drawn from the scatter box, which for each chain is shrunk towards x_init and the
-        middle of the controls by another factor from `closest` to 1, uniform in its logarithm. Far
-        from x_init bodies overlap, joints lock, and forces lose all measure; near to it, motions
-        that lead far away are not found.
+        They are drawn from the scatter box. Far from x_init bodies overlap, joints lock, and forces
+        lose all measure; near to it, motions that lead far away are not found. So with `near` the
+        box is shrunk towards x_init and the middle of the controls, for each chain by another
+        factor from `CLOSE` to 1, uniform in its logarithm.
         """
         if self.guess is not None:
             knots = self.guess(key)
@@ -363,9 +368,10 @@ class Problem:
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         x = box.x_lower + x * (box.x_upper - box.x_lower)
         u = box.u_lower + u * (box.u_upper - box.u_lower)
-        share = jnp.asarray(self.closest) ** jax.random.uniform(jax.random.fold_in(key, 2))
-        middle = 0.5 * (box.u_lower + box.u_upper)
-        x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
+        if self.near or dynamics.kinked or dynamics.nx != dynamics.ndx:
+            share = CLOSE ** jax.random.uniform(jax.random.fold_in(key, 2))
+            middle = 0.5 * (box.u_lower + box.u_upper)
+            x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
         return Trajectory(dynamics.valid(x), u)
 
     def replay(
