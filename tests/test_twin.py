@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, from_mjcf
-from mjx_drax.agreement import Probes, compare
+from mjx_drax.agreement import Engine, Probes, compare
 from mjx_drax.errors import DraxWarning
 from mjx_drax.physics import step
 from mjx_drax.twin import (
@@ -102,6 +102,15 @@ def test_limits_that_are_bounds_leave_the_dynamics():
     model = rigid(joint='range="-1 1" limited="true"')
     assert has_constraints(twin(model))
     assert not has_constraints(twin(model, bounded=np.array([True, False])))
+
+
+@pytest.mark.slow
+def test_at_a_limit_derivatives_are_those_to_one_side():
+    model = rigid(joint='range="-1 0" limited="true"')
+    at_limit = Probes(np.zeros((1, 4)), np.zeros((1, 2)))
+    ahead, behind = Engine(model).slopes(at_limit.x[0], at_limit.u[0])
+    assert np.abs(ahead - behind).max() > 0.1
+    assert compare(model, at_limit, derivatives=True).jacobian < 1e-4
 
 
 @pytest.mark.slow
