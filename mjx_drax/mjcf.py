@@ -494,9 +494,9 @@ def from_mjcf(
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
-            +-5 (rad/s or m/s) for velocities about x_init. Chains start nearer to x_init, some more
-            than others (see `Problem.draw`); those of a box given here only where contacts, limits
-            or dry friction act or states hold quaternions.
+            +-5 (rad/s or m/s) for velocities about x_init. Every second chain then starts nearer to
+            x_init, some more than others. Where contacts, limits or dry friction act, or states
+            hold quaternions, all do, also with a box given here: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the

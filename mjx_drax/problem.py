@@ -36,8 +36,7 @@ MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
 CLOSE = 0.03
-"""Least factor on the scatter of initial knots. Within +-3 rad and full torques of where it stood,
-no chain of an arm of seven joints found the way to a posture; from nearer all did."""
+"""Least factor on the scatter of initial knots of chains that start nearer to x_init."""
 
 
 @register_dataclass
@@ -237,8 +236,8 @@ class Problem:
         scatter: the box that initial knots are drawn from, uniformly.
         aside: goal, guess and name, which no compiled computation reads.
         horizon: K, number of control knots.
-        near: whether chains start nearer to x_init than the scatter; where f has kinks or states
-            hold quaternions they do anyway.
+        near: whether every second chain starts nearer to x_init than the scatter; where f has kinks
+            or states hold quaternions all do anyway.
     """
 
     dynamics: Dynamics
@@ -354,10 +353,11 @@ class Problem:
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.
 
-        They are drawn from the scatter box. Far from x_init bodies overlap, joints lock, and forces
-        lose all measure; near to it, motions that lead far away are not found. So with `near` the
-        box is shrunk towards x_init and the middle of the controls, for each chain by another
-        factor from `CLOSE` to 1, uniform in its logarithm.
+        They are drawn from the scatter box. Where f has kinks, bodies overlap far from x_init and
+        forces lose all measure; what floats freely may tumble at any speed. There the box is shrunk
+        towards x_init and the middle of the controls, for each chain by another factor from `CLOSE`
+        to 1, uniform in its logarithm. With `near` it is for every second chain: strong motors in
+        light arms need that, while motions that lead far away are found from afar.
         """
         if self.guess is not None:
             knots = self.guess(key)
@@ -368,8 +368,10 @@ class Problem:
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         x = box.x_lower + x * (box.x_upper - box.x_lower)
         u = box.u_lower + u * (box.u_upper - box.u_lower)
-        if self.near or dynamics.kinked or dynamics.nx != dynamics.ndx:
-            share = CLOSE ** jax.random.uniform(jax.random.fold_in(key, 2))
+        all_near = dynamics.kinked or dynamics.nx != dynamics.ndx
+        if self.near or all_near:
+            power = jax.random.uniform(jax.random.fold_in(key, 2))
+            share = CLOSE ** (power if all_near else jnp.maximum(2.0 * power - 1.0, 0.0))
             middle = 0.5 * (box.u_lower + box.u_upper)
             x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
         return Trajectory(dynamics.valid(x), u)

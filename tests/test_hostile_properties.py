@@ -32,7 +32,7 @@ from mjx_drax.restarts import as_restarts, initial_knots
 from mjx_drax.settings import changed, names
 
 bounded = settings(
-    max_examples=150,
+    max_examples=100,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
@@ -239,7 +239,7 @@ def test_any_text_is_a_model_or_a_complaint(text, xml):
     outcome(lambda: load("<" * xml + text))
 
 
-@settings(bounded, max_examples=400)
+@settings(bounded, max_examples=250)
 @given(data=st.data())
 def test_a_garbled_model_is_a_model_or_a_complaint(data):
     text = arm()

@@ -313,18 +313,17 @@ def test_models_may_come_compiled(tmp_path):
         problem(file)
 
 
-def test_chains_start_nearer_than_the_default_scatter():
+def test_every_second_chain_starts_nearer_than_the_default_scatter():
     def spread(problem):
         """How far the wrist turns in the initial knots of 64 chains, as shares of the scatter."""
         keys = jax.random.split(jax.random.key(0), 64)
         turned = jax.vmap(problem.draw)(keys).x[..., 1] - problem.x_init[1]
         return np.abs(turned).max(1) / np.asarray(problem.scatter.x_upper - problem.x_init)[1]
 
-    shares = spread(problem(arm()))
-    assert shares.min() < 0.06
-    assert 0.1 < np.median(shares) < 0.3
-    assert shares.max() > 0.7
-    assert spread(problem(arm(), x_scatter=(-3, 3))).min() > 0.3  # as it is told
+    near, told = spread(problem(arm())), spread(problem(arm(), x_scatter=(-np.pi, np.pi)))
+    assert near.min() < 0.06
+    np.testing.assert_allclose(np.mean(near > 0.99 * told), 0.5, atol=0.1)
+    assert told.min() > 0.3
 
 
 def test_a_singular_inertia_is_reported_once(tmp_path, monkeypatch, capfd):
