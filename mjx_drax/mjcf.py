@@ -616,8 +616,12 @@ def require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> Non
     set_state(model, data, x_init)
     with quiet():
         mujoco.mj_forward(model, data)
-    least, along = _least_inertia(model, data)
-    if not least > SINGULAR:
+    M = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    scale = np.sqrt(np.diag(M))
+    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+    if not values[0] > SINGULAR:
+        along = vectors[:, 0]
         joints = model.dof_jntid[np.abs(along) > 0.5 * np.abs(along).max()]
         names = ", ".join(str(model.joint(j).name or j) for j in dict.fromkeys(joints.tolist()))
         raise DraxError(
@@ -626,15 +630,6 @@ def require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> Non
         )
     if not np.isfinite(data.qacc).all():
         raise DraxError(f"{name} has no finite acceleration at x_init: give another x_init.")
-
-
-def _least_inertia(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, np.ndarray]:
-    """Least eigenvalue of the inertia, scaled to a diagonal of ones, and its eigenvector (nv,)."""
-    M = np.empty((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, M)
-    scale = np.sqrt(np.diag(M))
-    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-    return float(values[0]), vectors[:, 0]
 
 
 def require_traceable(
