@@ -30,7 +30,7 @@ from mjx_drax._mujoco import mujoco
 from mjx_drax.collision import collision
 from mjx_drax.joints import Joints
 from mjx_drax.linalg import cholesky, solve, symmetric
-from mjx_drax.tree import kinematics
+from mjx_drax.tree import com_pos, com_vel, kinematics, mass_matrix, rne
 
 TURNING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
@@ -68,18 +68,37 @@ def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
         model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
     data = mjx.sensor_pos(model, _at_positions(model, data))
-    data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
-    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    data = mjx.sensor_vel(model, _at_velocities(model, data))
+    data = _accelerated(model, mjx.fwd_actuation(model, data))
     return mjx.sensor_acc(model, _constrained(model, data))
 
 
 def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_position`, with another kinematics."""
-    data = mjx.camlight(model, mjx.com_pos(model, kinematics(model, data)))
-    data = mjx.crb(model, mjx.tendon(model, data))
-    data = mjx.factor_m(model, mjx.tendon_armature(model, data))
-    data = mjx.make_constraint(model, collision(model, data))
-    return mjx.transmission(model, data)
+    """`mjx.fwd_position`, without its walks along the tree and factors of M."""
+    data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
+    data = mass_matrix(model, mjx.tendon(model, data))
+    data = collision(model, mjx.tendon_armature(model, data))
+    return mjx.transmission(model, mjx.make_constraint(model, data))
+
+
+def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_velocity`, without its walks along the tree."""
+    data = data.tree_replace(
+        {
+            "_impl.actuator_velocity": data._impl.actuator_moment @ data.qvel,
+            "_impl.ten_velocity": data._impl.ten_J @ data.qvel,
+        }
+    )
+    data = rne(model, mjx.passive(model, com_vel(model, data)))
+    return mjx.tendon_bias(model, data)
+
+
+def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_acceleration`: `data` with the acceleration that constraints do not change."""
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    force = force + data.qfrc_applied + mjx.xfrc_accumulate(model, data)
+    qacc = solve(cholesky(data._impl.M), force)
+    return data.replace(qfrc_smooth=force, qacc_smooth=qacc)
 
 
 def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
@@ -99,18 +118,15 @@ def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         forces = Context.create(model, data.replace(qacc=qacc), grad=False)
         return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
-    dense = (  # its product is one then, and not scattered sums, which GPUs are slow at
-        model.tree_replace({"opt.jacobian": mujoco.mjtJacobian.mjJAC_DENSE}),
-        data.tree_replace({"_impl.M": mjx.full_m(model, data)}),
-    )
-    frozen = jax.lax.stop_gradient(dense)
+    given = model, data
+    frozen = jax.lax.stop_gradient(given)
 
     def hessian(qacc: Array) -> Array:
         return symmetric(jax.jacfwd(lambda a: law(*frozen, a)[0])(qacc))
 
     found = _minimum(partial(law, *frozen), hessian, frozen[1].qacc_smooth)
-    qacc = found - solve(cholesky(hessian(found)), law(*dense, found)[0])
-    _, forces = law(*dense, qacc)
+    qacc = found - solve(cholesky(hessian(found)), law(*given, found)[0])
+    _, forces = law(*given, qacc)
     return data.replace(
         qacc=qacc,
         qfrc_constraint=forces.Ma - data.qfrc_smooth,
@@ -169,7 +185,7 @@ def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
         fall = mjx.deriv_smooth_vel(model, data)
         if fall is None:
             return data.qacc
-    M = symmetric(mjx.full_m(model, data) - h * fall)
+    M = symmetric(data._impl.M - h * fall)
     return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
 
 

@@ -83,10 +83,17 @@ def _on_gpu() -> bool:
 
 
 def _in_kernel(limit: int, closed: ClosedJaxpr, flat: Sequence[Any]) -> list[Any]:
-    """In operations that one kernel applies to all rows of a batch."""
+    """In operations that one kernel applies to all rows of a batch.
+
+    It writes each number once, and none that is known, as most entries of large Jacobians are: its
+    compilation takes long where it writes many.
+    """
     numbers = [*closed.consts, *flat]
     traced = [isinstance(number, jax.core.Tracer) for number in numbers]
     inputs = [number for number, is_traced in zip(numbers, traced, strict=True) if is_traced]
+
+    found: dict[Any, Scalar] = {}  # distinct entries of the outputs
+    keys: list[Any] = []  # of all entries
 
     def in_scalars(*entries: Scalar) -> list[Scalar]:
         left, values = iter(entries), list(numbers)
@@ -95,20 +102,27 @@ def _in_kernel(limit: int, closed: ClosedJaxpr, flat: Sequence[Any]) -> list[Any
                 values[i] = _array([next(left) for _ in range(number.size)], number.shape)
         consts, arguments = values[: len(closed.consts)], values[len(closed.consts) :]
         outputs = _Evaluation(limit).outputs(closed, consts, arguments)
-        return [scalar for output in outputs for scalar in _flat(output)]
+        scalars = [scalar for output in outputs for scalar in _flat(output)]
+        keys.extend(map(_key, scalars))
+        found.update(zip(keys, scalars, strict=True))
+        return [scalar for scalar in found.values() if not isinstance(scalar, np.generic)]
 
     dtype, entries = np.dtype(np.float32), sum(number.size for number in inputs)
     avals: list[Any] = [*(number.aval for number in inputs), *closed.out_avals]
     if not inputs or any(a.dtype != dtype for a in avals) or entries > limit:
         return _in_loops(limit, closed, flat)
     program = jax.make_jaxpr(in_scalars)(*[jax.ShapeDtypeStruct((), dtype)] * entries)
-    if not all(equation.primitive.name in _IN_KERNELS for equation in program.eqns):
+    plain = all(equation.primitive.name in _IN_KERNELS for equation in program.eqns)
+    if not (plain and program.out_avals):
         return _in_loops(limit, closed, flat)
     from mjx_drax.scalar_kernel import by_rows  # only here: importing Pallas takes a second
 
     shapes = [aval.shape for aval in closed.out_avals]
     sizes = [math.prod(shape) for shape in shapes]
-    parts = lax.split(by_rows(program)(*inputs), sizes)
+    known = {key: scalar for key, scalar in found.items() if isinstance(scalar, np.generic)}
+    places = {key: i for i, key in enumerate([*(k for k in found if k not in known), *known])}
+    distinct = lax.concatenate([by_rows(program)(*inputs), np.array([*known.values()], dtype)], 0)
+    parts = lax.split(distinct[np.array([places[key] for key in keys])], sizes)
     return [lax.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
 
 

@@ -1,9 +1,14 @@
-"""Kinematics of a tree of bodies, without a walk along the tree.
+"""Kinematics and smooth dynamics of a tree of bodies, without a walk along the tree.
 
 MJX walks: it repeats the same few operations for every level of the tree and every kind of joint,
-and compilers need time in proportion. Here each is written once, for all joints or bodies. Frames
-are composed by doubling: each knows its place in an ancestor's; composed with that of the ancestor,
-it knows its place in one twice as far up. After log2(depth) rounds that is the world.
+and compilers need time in proportion. (GPUs' need more: they fuse what a level needs into each of
+its readers, again and again.) Here each is written once, for all joints or bodies.
+
+Frames are composed by doubling: each knows its place in an ancestor's; composed with that of the
+ancestor, it knows its place in one twice as far up. After log2(depth) rounds that is the world.
+Velocities, accelerations, forces and inertias add up along the tree. With S[b, d] = 1 where degree
+of freedom d moves body b, and else 0, sums over what is above are products with S, and sums over
+what is below with its transpose.
 
 Products of small matrices are sums of three terms: compilers fuse these, but neither reductions nor
 calls of a library.
@@ -111,6 +116,129 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         site_xpos=site_xpos,
         site_xmat=site_xmat,
     )
+
+
+def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.com_pos`: `data` with centres of mass, inertias and motions about them.
+
+    subtree_com (nbody, 3); cinert (nbody, 10) and cdof (nv, 6), about the centre of mass of all
+    that hangs on the same body of the world; motions are turning first, then moving.
+    """
+    inside = _Sums.of(model).subtrees
+    mass = model.body_mass[:, None]
+    below = _summed(inside, mass)
+    whole = jnp.maximum(below, mujoco.mjMINVAL)
+    com = jnp.where(below < mujoco.mjMINVAL, data.xipos, _summed(inside, mass * data.xipos) / whole)
+    about = com[model.body_rootid]
+    away = data.xipos - about
+    inertia = _product(data.ximat * model.body_inertia[:, None], jnp.swapaxes(data.ximat, 1, 2))
+    far = jnp.sum(away * away, axis=1)[:, None, None] * jnp.eye(3)
+    inertia = inertia + mass[:, :, None] * (far - away[:, :, None] * away[:, None])
+    rows, columns = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+    cinert = jnp.concatenate([inertia[:, rows, columns], mass * away, mass], axis=1)
+
+    kinds, joint, body = np.asarray(model.jnt_type), model.dof_jntid, model.dof_bodyid
+    kind, within = kinds[joint], np.arange(model.nv) - np.asarray(model.jnt_dofadr)[joint]
+    moves = (kind == _SLIDE) | ((kind == _FREE) & (within < 3))
+    turns = data.xmat[body, :, within % 3]  # columns of a matrix: the body's own axes
+    axes = jnp.where((kind == _FREE)[:, None] & moves[:, None], jnp.eye(3)[within % 3], turns)
+    axes = jnp.where(np.isin(kind, (_SLIDE, _HINGE))[:, None], data.xaxis[joint], axes)
+    swept = jnp.cross(axes, about[body] - data.xanchor[joint])
+    turning = jnp.where(moves[:, None], 0.0, axes)
+    cdof = jnp.concatenate([turning, jnp.where(moves[:, None], axes, swept)], axis=1)
+    return data.tree_replace({"subtree_com": com, "_impl.cinert": cinert, "cdof": cdof})
+
+
+def mass_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.crb`: `data` with the joint-space inertia M, dense (nv, nv).
+
+    M[i, j] = cdof_j . I_i cdof_i for a degree of freedom j that moves what i moves, with I_i the
+    inertia of all of that.
+    """
+    sums = _Sums.of(model)
+    moved = _inertia_times(_summed(sums.moves.T, data._impl.cinert), data.cdof)
+    products = jnp.sum(moved[:, None] * data.cdof, axis=2)
+    below = jnp.where(np.tril(sums.moves[model.dof_bodyid]) > 0, products, 0.0)
+    M = below + jnp.tril(below, -1).T + jnp.diag(model.dof_armature)
+    return data.tree_replace({"_impl.M": M})
+
+
+def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.com_vel`: `data` with velocities cvel (nbody, 6) and rates of cdof (nv, 6)."""
+    sums = _Sums.of(model)
+    velocity = data.cdof * data.qvel[:, None]
+    above = _summed(np.concatenate([sums.moves, sums.before]), velocity)
+    cvel, before = above[: model.nbody], above[model.nbody :]
+    return data.replace(cvel=cvel, cdof_dot=_crossed(before, data.cdof))
+
+
+def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.rne`: `data` with the forces qfrc_bias (nv,) of gravity and velocities."""
+    moves, inertia = _Sums.of(model).moves, data._impl.cinert
+    acceleration = _summed(moves, data.cdof_dot * data.qvel[:, None])
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        acceleration = acceleration - jnp.concatenate([jnp.zeros(3), model.opt.gravity])
+    momentum = _inertia_times(inertia, data.cvel)
+    force = _inertia_times(inertia, acceleration) + _crossed_force(data.cvel, momentum)
+    return data.replace(qfrc_bias=jnp.sum(data.cdof * _summed(moves.T, force), axis=1))
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Which rows add up, as matrices of zeros and ones.
+
+    Attributes:
+        moves: S, degrees of freedom that move a body, (nbody, nv).
+        before: those that move a degree of freedom's axis, (nv, nv).
+        subtrees: bodies that hang on a body, itself included, (nbody, nbody).
+    """
+
+    moves: np.ndarray
+    before: np.ndarray
+    subtrees: np.ndarray
+
+    @classmethod
+    def of(cls, model: mjx.Model) -> _Sums:
+        """Those of a model."""
+        subtrees = np.eye(model.nbody)
+        for body in reversed(range(1, model.nbody)):
+            subtrees[model.body_parentid[body]] += subtrees[body]
+        moves = subtrees[np.asarray(model.dof_bodyid, int)].T
+        # On the same body, earlier joints count; of a free one its moving, for its turning
+        joint, dof = np.asarray(model.dof_jntid, int), np.arange(model.nv)
+        begins = np.asarray(model.jnt_dofadr, int)[joint]
+        free = np.asarray(model.jnt_type, int)[joint] == _FREE
+        begins = np.where(free, np.where(dof < begins + 3, 0, begins + 3), begins)
+        before = moves[np.asarray(model.dof_bodyid, int)] * (dof < begins[:, None])
+        return cls(moves, before, subtrees)
+
+
+def _summed(which: np.ndarray, rows: Array) -> Array:
+    """Sums (m, k) of those rows (n, k) that each row of `which` (m, n) marks."""
+    return jnp.sum(which[:, :, None].astype(rows.dtype) * rows, axis=1)
+
+
+def _inertia_times(inertia: Array, motion: Array) -> Array:
+    """Momenta (n, 6) of bodies with inertias (n, 10) in motions (n, 6)."""
+    whole = inertia[:, np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
+    off, mass = inertia[:, 6:9], inertia[:, 9:]
+    turning, moving = motion[:, :3], motion[:, 3:]
+    angular = _applied(whole, turning) + jnp.cross(off, moving)
+    return jnp.concatenate([angular, mass * moving - jnp.cross(off, turning)], axis=1)
+
+
+def _crossed(v: Array, motion: Array) -> Array:
+    """Rates (n, 6) of motions (n, 6) that velocities (n, 6) carry along."""
+    (turn, move), (turning, moving) = (jnp.split(a, 2, axis=1) for a in (v, motion))
+    along = jnp.cross(move, turning) + jnp.cross(turn, moving)
+    return jnp.concatenate([jnp.cross(turn, turning), along], axis=1)
+
+
+def _crossed_force(v: Array, force: Array) -> Array:
+    """Rates (n, 6) of forces or momenta (n, 6) that velocities (n, 6) carry along."""
+    (turn, move), (twist, push) = (jnp.split(a, 2, axis=1) for a in (v, force))
+    around = jnp.cross(turn, twist) + jnp.cross(move, push)
+    return jnp.concatenate([around, jnp.cross(turn, push)], axis=1)
 
 
 def _of_kind(model: mjx.Model, *kinds: int) -> tuple[np.ndarray, np.ndarray]:

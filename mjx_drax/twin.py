@@ -106,7 +106,7 @@ def _with_springs(model: mjx.Model) -> mjx.Model:
 def _mend(model: mujoco.MjModel) -> None:
     """Change a model into one that MJX knows, with the same motions (or nearly: `differences`)."""
     opt = model.opt
-    opt.jacobian = int(mujoco.mjtJacobian.mjJAC_SPARSE)  # factorizes M without LAPACK: see `linalg`
+    opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # M as `physics` has it
     opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all find the same minimum
     if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
         opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)

@@ -1,4 +1,4 @@
-"""Kinematics: the frames that MJX finds by walking along the tree."""
+"""Kinematics and smooth dynamics: what MJX finds by walking along the tree."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 from mjx_drax._mjx import mjx
 from mjx_drax._mujoco import mujoco
 from mjx_drax.models import path
-from mjx_drax.tree import kinematics
+from mjx_drax.tree import com_pos, com_vel, kinematics, mass_matrix, rne
 
 EVERY_JOINT = """<mujoco><worldbody>
 <body name="moved" mocap="true" pos="1 0 0" quat="0.6 0.8 0 0"><geom size="0.1"/></body>
@@ -21,19 +21,55 @@ EVERY_JOINT = """<mujoco><worldbody>
 FRAMES = ("xanchor", "xaxis", "xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
 
 
-@pytest.mark.parametrize("model", [EVERY_JOINT, "humanoid"])
-def test_frames_are_those_of_mjx(model):
+MODELS = [EVERY_JOINT, "humanoid", "double_pendulum"]
+
+
+def drawn(model):
+    """A model, in MuJoCo and on the device, and data at random positions and velocities."""
     if model == EVERY_JOINT:
         host = mujoco.MjModel.from_xml_string(model)
     else:
         host = mujoco.MjModel.from_xml_path(str(path(model)))
+    host.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    device, random = mjx.put_model(host, impl="jax"), np.random.default_rng(0)
+    qpos, qvel = (jnp.asarray(random.normal(size=n)) for n in (host.nq, host.nv))
+    return host, device, mjx.make_data(host, impl="jax").replace(qpos=qpos, qvel=qvel)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_frames_are_those_of_mjx(model):
     with jax.enable_x64(True):
-        device = mjx.put_model(host, impl="jax")
-        drawn = np.random.default_rng(0).normal(size=host.nq)
-        data = mjx.make_data(host, impl="jax").replace(qpos=jnp.asarray(drawn))
+        _, device, data = drawn(model)
         found, expected = (jax.jit(f)(device, data) for f in (kinematics, mjx.kinematics))
         for name in (*FRAMES, "site_xpos", "site_xmat", "qpos"):
             ours, theirs = np.asarray(getattr(found, name)), np.asarray(getattr(expected, name))
             if name == "xquat":  # q and -q are the same rotation
                 theirs = theirs * np.sign((ours * theirs).sum(axis=1, keepdims=True))
             np.testing.assert_allclose(ours, theirs, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("model", MODELS)
+def test_inertias_velocities_and_bias_forces_are_those_of_the_c_engine(model, gravity):
+    with jax.enable_x64(True):
+        host, _, data = drawn(model)
+        if not gravity:
+            host.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        c_data = mujoco.MjData(host)
+        c_data.qpos[:], c_data.qvel[:] = data.qpos, data.qvel
+        mujoco.mj_forward(host, c_data)
+
+        @jax.jit
+        def everything(data):
+            data = com_vel(device, com_pos(device, kinematics(device, data)))
+            return rne(device, mass_matrix(device, data))
+
+        device = mjx.put_model(host, impl="jax")
+        found, M = everything(data), np.zeros((host.nv, host.nv))
+        mujoco.mj_fullM(host, c_data, M)
+        np.testing.assert_allclose(found._impl.M, M, atol=1e-9)
+        np.testing.assert_allclose(found._impl.cinert[1:], c_data.cinert[1:], atol=1e-9)
+        for name in ("subtree_com", "cdof", "cvel", "cdof_dot", "qfrc_bias"):
+            np.testing.assert_allclose(
+                getattr(found, name), getattr(c_data, name), atol=1e-9, err_msg=name
+            )
