@@ -19,6 +19,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.tree_util import register_dataclass
 
+from mjx_drax.linalg import transposed_product
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -41,8 +43,8 @@ def eliminate(
     t = slope + force[equalities:]
     G = J[equalities:]
     weights = jnp.concatenate([jnp.full(equalities, 1.0) * penalty, penalty * curvature / D])
-    gradient = J.T @ force - G.T @ (penalty * t / D)
-    return gradient, J.T @ (weights[:, None] * J), Eliminated(J, r, t, D)
+    gradient = transposed_product(J, force) - transposed_product(G, penalty * t / D)
+    return gradient, transposed_product(J, weights[:, None] * J), Eliminated(J, r, t, D)
 
 
 def recover(

@@ -540,9 +540,8 @@ def _keep_finite(old: State, new: State, iteration: Array, moves: Array | None =
     before, after = ({name: getattr(state, name) for name in names} for state in (old, new))
     pairs = zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True)
     moved = [a for a, b in pairs if a is not b]
-    finite = jnp.stack([jnp.all(jnp.isfinite(a), axis=tuple(range(1, a.ndim))) for a in moved]).all(
-        0
-    )
+    vanishing = [jnp.sum(0.0 * a, axis=tuple(range(1, a.ndim))) for a in moved]  # or NaN
+    finite = jnp.isfinite(sum(vanishing))
     finite = finite if moves is None else finite | ~moves
     alive = old.alive & finite
     new_ones = alive if moves is None else alive & moves

@@ -17,6 +17,10 @@ from jax.scipy.linalg import solve_triangular
 
 UNROLLED_UP_TO = 8
 
+SUMMED_UP_TO = 256
+"""Entries of a factor up to which a `transposed_product` is a sum on GPUs, which fuses: their
+library takes a block of threads for each product of a batch, however small."""
+
 
 exact = jax.default_matmul_precision("float32")
 """Context, or decorator, in which products are of float32 numbers. GPUs round factors to 10 bits by
@@ -113,6 +117,20 @@ def solve_upper(factor: Array, b: Array) -> Array:
 def solve(factor: Array, b: Array) -> Array:
     """(L L')^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
     return solve_upper(factor, solve_lower(factor, b))
+
+
+def transposed_product(J: Array, A: Array) -> Array:
+    """J' A, (n, k) or (n,), for J (m, n) and A (m, k) or (m,)."""
+
+    def product(J: Array, A: Array) -> Array:
+        return J.T @ A
+
+    def summed(J: Array, A: Array) -> Array:
+        return jnp.sum(J.reshape(*J.shape, *[1] * (A.ndim - 1)) * A[:, None], axis=0)
+
+    if J.size > SUMMED_UP_TO:
+        return product(J, A)
+    return jax.lax.platform_dependent(J, A, cpu=product, default=summed)
 
 
 def symmetric(matrix: Array) -> Array:

@@ -30,6 +30,7 @@ from mjx_drax.errors import (
     shown,
 )
 from mjx_drax.functions import require_functions, require_shape, traced
+from mjx_drax.linalg import transposed_product
 from mjx_drax.scalar import pruned
 
 MOST = 1_000_000
@@ -168,8 +169,8 @@ class Cost:
         if self.residual is not None:
             residual = self.residual
             jacobian, r = by.jacobian(lambda dz: jnp.ravel(residual(*at(dz))), size, key)
-            gradient = gradient + jacobian.T @ r
-            hessian = hessian + jacobian.T @ jacobian
+            gradient = gradient + transposed_product(jacobian, r)
+            hessian = hessian + transposed_product(jacobian, jacobian)
         return gradient, hessian
 
 

@@ -4,7 +4,16 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_drax.linalg import UNROLLED_UP_TO, cholesky, solve, solve_lower, solve_upper, symmetric
+from mjx_drax.linalg import (
+    SUMMED_UP_TO,
+    UNROLLED_UP_TO,
+    cholesky,
+    solve,
+    solve_lower,
+    solve_upper,
+    symmetric,
+    transposed_product,
+)
 
 BATCH = 3
 
@@ -74,3 +83,18 @@ def test_an_indefinite_matrix_gives_nan_not_an_exception(n):
 def test_symmetric_part():
     M = np.arange(18.0).reshape(2, 3, 3)
     np.testing.assert_array_equal(symmetric(M), (M + M.swapaxes(1, 2)) / 2)
+
+
+@pytest.mark.parametrize("columns", [(), (4,)])
+@pytest.mark.parametrize("rows", [0, 3, SUMMED_UP_TO])
+def test_transposed_products_are_the_same_however_they_are_written(rows, columns, monkeypatch):
+    rng = np.random.default_rng(rows)
+    J, A = rng.normal(size=(BATCH, rows, 5)), rng.normal(size=(BATCH, rows, *columns))
+    wanted = np.einsum("bmn,bm...->bn...", J, A)
+    np.testing.assert_allclose(jax.vmap(transposed_product)(J, A), wanted, atol=1e-9)
+
+    def as_on_gpus(J, A, cpu, default):
+        return default(J, A)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", as_on_gpus)
+    np.testing.assert_allclose(jax.vmap(transposed_product)(J, A), wanted, atol=1e-9)
