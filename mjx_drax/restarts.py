@@ -296,6 +296,7 @@ class _Search:
                 _gather((state, info), (state, info), everyone)
             if self.recorder is not None:
                 knot_defects(self.problem, state.trajectory)
+            first.sigma(0)
         compile_time = time.perf_counter() - clock
 
         self.clock = time.perf_counter() - before
