@@ -267,6 +267,26 @@ def test_the_kernel_computes_every_row():
     np.testing.assert_allclose(seen, wanted.reshape(rows, -1), rtol=1e-6)
 
 
+def test_kernels_write_each_number_once_and_none_that_is_known(strictly, monkeypatch):
+    written, by_rows = set(), scalar_kernel.by_rows
+
+    def counted(program, *batched):
+        written.add(len(program.out_avals))
+        return by_rows(program, *batched)
+
+    def mostly_known(x):
+        once = jnp.diag(jnp.sin(x))
+        return jnp.stack([once, 2.0 * jnp.eye(3), once])
+
+    monkeypatch.setattr(scalar, "_on_gpu", lambda: True)
+    monkeypatch.setattr(scalar_kernel, "by_rows", counted)
+    x = jnp.asarray(A, jnp.float32).reshape(-1)[:6].reshape(2, 3)
+    for function in (mostly_known, lambda x: jnp.outer(jnp.ones(2), jnp.ones(3))):
+        seen = jax.jit(jax.vmap(scalarized(function, outermost=True)))(x)
+        close(seen, jax.vmap(function)(x), 1e-6)
+    assert written == {3}
+
+
 @pytest.mark.parametrize("name", sorted(scalar._IN_KERNELS))
 def test_kernels_hold_only_what_pallas_lowers(name):
     from jax._src.pallas.triton.lowering import triton_lowering_rules
