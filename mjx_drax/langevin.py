@@ -540,8 +540,8 @@ def _keep_finite(old: State, new: State, iteration: Array, moves: Array | None =
     before, after = ({name: getattr(state, name) for name in names} for state in (old, new))
     pairs = zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True)
     moved = [a for a, b in pairs if a is not b]
-    vanishing = [jnp.sum(0.0 * a, axis=tuple(range(1, a.ndim))) for a in moved]  # or NaN
-    finite = jnp.isfinite(sum(vanishing))
+    # 0, or NaN where an entry is not finite: one pass over each array, and no array of truth values
+    finite = sum(jnp.sum(0.0 * a, axis=tuple(range(1, a.ndim))) for a in moved) == 0.0
     finite = finite if moves is None else finite | ~moves
     alive = old.alive & finite
     new_ones = alive if moves is None else alive & moves

@@ -1,6 +1,6 @@
 """One step of MJX, with derivatives that hold at rest and in contact.
 
-Four things differ from `mjx.step`, the first three not in value:
+Five things differ from `mjx.step`, all but the last not in value:
 
 - Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), whose law s is MJX's. Newton's method
@@ -10,6 +10,8 @@ Four things differ from `mjx.step`, the first three not in value:
   semi-implicit integrators end with this, so only the end is replaced; Runge-Kutta integrates at
   every stage and is written out.
 - The forces of springs on ball and free joints go through the same quaternions.
+- What adds up along the tree of bodies is computed without walking along it, by `tree`, and the
+  inertia M is dense and factorized by `linalg`.
 - Boxes on planes have the contacts of the C engine; see `collision`.
 """
 
