@@ -29,7 +29,8 @@ import sys, time
 import jax
 from mjx_drax import devices
 
-count = len(jax.devices())
+count = int(sys.argv[2])
+assert len(jax.devices()) == count
 solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, attempts=2)
 alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, count))
 
@@ -80,7 +81,7 @@ def test_several_devices_give_the_answers_of_one(count, tmp_path):
     flags = f"--xla_force_host_platform_device_count={count}"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     ran = subprocess.run(
-        [sys.executable, "-c", PROBLEM + PROGRAM, str(tmp_path / "run.ckpt")],
+        [sys.executable, "-c", PROBLEM + PROGRAM, str(tmp_path / "run.ckpt"), str(count)],
         env=environment,
         capture_output=True,
         text=True,
