@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -28,6 +28,7 @@ from mjx_drax.errors import DraxError, reason, require_whole, shown
 from mjx_drax.functions import plain, require_functions
 from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, advance, evaluate, ranking, worth
 from mjx_drax.problem import Problem, Trajectory, checked
+from mjx_drax.pytrees import Static, register_dataclass
 from mjx_drax.restarts import (
     MORE,
     Restarts,
@@ -47,6 +48,7 @@ COPIES = 40
 plans with 7 to 8 for the cart-pole and the acrobot on a CPU; the rest is for what was not tried."""
 
 
+@register_dataclass
 @dataclass(frozen=True)
 class Family:
     """Problems that differ in some of their numbers.
@@ -58,8 +60,8 @@ class Family:
     """
 
     problem: Problem
-    differs: tuple[bool, ...]
-    count: int
+    differs: tuple[bool, ...] = field(metadata=Static)
+    count: int = field(metadata=Static)
 
     @classmethod
     def of(cls, make: Callable[[Any], Problem], values: Any) -> Family:
@@ -196,9 +198,6 @@ def _faults(problem: Problem) -> Array:
     outside = above(box.x_lower, x) | above(x, box.x_upper)
     alike = box.x_lower.ndim == box.x_upper.ndim == 1  # bounds of single knots do not hold for x_0
     return jnp.stack([~jnp.isfinite(x).all(), crossed, outside & alike])
-
-
-jax.tree_util.register_dataclass(Family, data_fields=["problem"], meta_fields=["differs", "count"])
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.problem import Box, Trajectory
+from mjx_drax.pytrees import register_dataclass
 
 FOLLOW = 100.0
 """Largest factor between a bound's multiplier and rho / slack."""

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 
 from mjx_drax.linalg import transposed_product
+from mjx_drax.pytrees import register_dataclass
 
 
 @register_dataclass

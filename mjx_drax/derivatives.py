@@ -14,11 +14,10 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
-from mjx_drax.dynamics import Static
 from mjx_drax.linalg import symmetric
+from mjx_drax.pytrees import Static, register_dataclass
 from mjx_drax.scalar import pruned, scalarized
 
 Function = Callable[[Array], Array]

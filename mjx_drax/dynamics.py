@@ -19,13 +19,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import Partial, register_dataclass
+from jax.tree_util import Partial
 
-Static: dict[str, Any] = {"static": True}
+from mjx_drax.pytrees import Static, register_dataclass
 
 
 class Dynamics:
     """What the solver asks of a system: sizes, f, state arithmetic and what costs see.
+
+    A system is a frozen dataclass under `pytrees.register_dataclass`.
 
     Attributes:
         nx: numbers in a state.

@@ -26,12 +26,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.bounds import LogBarrier, Sides
 from mjx_drax.derivatives import Autodiff
-from mjx_drax.dynamics import Static
 from mjx_drax.errors import DraxError, require_part, require_whole, shown
 from mjx_drax.functions import require_derivatives
 from mjx_drax.linalg import exact
@@ -48,6 +46,7 @@ from mjx_drax.precondition import (
     displaced,
 )
 from mjx_drax.problem import Problem, Stagewise, Trajectory, Values, functions_of, numbers
+from mjx_drax.pytrees import Static, register_dataclass
 from mjx_drax.quasi_newton import LBFGS
 from mjx_drax.scalar import pruned
 from mjx_drax.schedules import Constant, Geometric

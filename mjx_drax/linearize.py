@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import jax
 from jax import Array
-from jax.tree_util import register_dataclass
 
 from mjx_drax.derivatives import Differentiator
 from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.pytrees import register_dataclass
 
 
 @register_dataclass

@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import Partial, register_dataclass
+from jax.tree_util import Partial
 from jax.typing import ArrayLike
 
 from mjx_drax.errors import (
@@ -46,6 +46,7 @@ from mjx_drax.langevin import FEASIBLE, Info, Langevin, Scale, State, evaluate, 
 from mjx_drax.linalg import exact
 from mjx_drax.precondition import GaussNewton
 from mjx_drax.problem import Cost, Problem, Stagewise, Trajectory, checked, numbers
+from mjx_drax.pytrees import register_dataclass
 from mjx_drax.restarts import Restarts, as_restarts, run, unit_of
 from mjx_drax.scalar import pruned
 

@@ -17,7 +17,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.bounds import LogBarrier, Projection, Reflection, Sides
@@ -25,6 +24,7 @@ from mjx_drax.constraints import Eliminated, eliminate, recover
 from mjx_drax.derivatives import Autodiff, Differentiator
 from mjx_drax.linearize import Linearization, linearize
 from mjx_drax.problem import Problem, Stagewise, Trajectory, Values
+from mjx_drax.pytrees import register_dataclass
 from mjx_drax.riccati import QuadraticCost, White, newton
 
 Bounds = LogBarrier | Projection | Reflection

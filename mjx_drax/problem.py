@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import Partial, register_dataclass
+from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from mjx_drax.derivatives import Differentiator, positive_part
-from mjx_drax.dynamics import Dynamics, FunctionDynamics, Static, as_partial
+from mjx_drax.dynamics import Dynamics, FunctionDynamics, as_partial
 from mjx_drax.errors import (
     DraxError,
     reason,
@@ -31,6 +31,7 @@ from mjx_drax.errors import (
 )
 from mjx_drax.functions import require_functions, require_shape, traced
 from mjx_drax.linalg import transposed_product
+from mjx_drax.pytrees import Static, register_dataclass
 from mjx_drax.scalar import pruned
 
 MOST = 1_000_000

@@ -18,11 +18,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.flatten_util import ravel_pytree
-from jax.tree_util import register_dataclass
 
-from mjx_drax.dynamics import Static
 from mjx_drax.precondition import Bounds, Direction, Identity, Levels, Multipliers, at_rest
 from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.pytrees import Static, register_dataclass
 
 
 @register_dataclass

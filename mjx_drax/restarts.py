@@ -30,7 +30,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
@@ -51,6 +50,7 @@ from mjx_drax.langevin import (
     undiagnosed,
 )
 from mjx_drax.problem import Problem, Trajectory, functions_of, numbers
+from mjx_drax.pytrees import register_dataclass
 from mjx_drax.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.schedules import Geometric
 

@@ -37,10 +37,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.custom_batching import custom_vmap
-from jax.tree_util import register_dataclass
 
 from mjx_drax.linalg import cholesky, solve, solve_upper, symmetric
 from mjx_drax.linearize import Linearization
+from mjx_drax.pytrees import register_dataclass
 
 MAX_NDX, MAX_NU = 6, 4
 """Largest blocks that the kernel unrolls; compiling it takes longer than it saves beyond."""

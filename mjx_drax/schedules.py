@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
+
+from mjx_drax.pytrees import register_dataclass
 
 
 @register_dataclass

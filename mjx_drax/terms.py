@@ -19,16 +19,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import register_dataclass
 from numpy.typing import ArrayLike
 
 from mjx_drax import quaternion
 from mjx_drax._mujoco import mujoco
 from mjx_drax.distances import DISTANCES, SPHERE, Shape
-from mjx_drax.dynamics import Static, as_partial
+from mjx_drax.dynamics import as_partial
 from mjx_drax.errors import DraxError, shown
 from mjx_drax.mjcf import index, load
 from mjx_drax.problem import numbers as real_numbers
+from mjx_drax.pytrees import Static, register_dataclass
 
 Names = str | Iterable[str]
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.tree_util import register_dataclass
 
 from mjx_drax import (
     DraxError,
@@ -27,6 +26,7 @@ from mjx_drax import (
 )
 from mjx_drax.dynamics import FunctionDynamics
 from mjx_drax.errors import DraxWarning
+from mjx_drax.pytrees import register_dataclass
 
 DT, CHAINS = 0.1, 4
 SOLVER = Restarts(

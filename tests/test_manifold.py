@@ -17,6 +17,7 @@ from mjx_drax.joints import Joints
 from mjx_drax.langevin import advance
 from mjx_drax.precondition import Levels, augmented_lagrangian, displaced
 from mjx_drax.problem import Trajectory
+from mjx_drax.pytrees import register_dataclass
 from mjx_drax.terms import Terms
 
 K = 5
@@ -27,7 +28,7 @@ class Seen(NamedTuple):
     qvel: jax.Array
 
 
-@jax.tree_util.register_dataclass
+@register_dataclass
 @dataclass(frozen=True)
 class Spinning(Dynamics):
     """A ball of inertia 0.1 kg m^2 under torques and damping; x = [q (4), w (3)]."""

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from mjx_drax.cli import _optima, main
 from mjx_drax.dynamics import FunctionDynamics, as_partial
 from mjx_drax.optima import TOLERANCE, cluster, distinct
 from mjx_drax.plotting import plot_optima
+from mjx_drax.pytrees import register_dataclass
 from mjx_drax.solution import solve
 
 K = 40
@@ -102,7 +102,7 @@ def test_differences_are_those_of_the_dynamics():
         def difference(self, x, y):
             return jnp.mod(x - y + np.pi, 2 * np.pi) - np.pi
 
-    circle = jax.tree_util.register_dataclass(Circle)(as_partial(lambda x, u: x), 0.1, 2, 1)
+    circle = register_dataclass(Circle)(as_partial(lambda x, u: x), 0.1, 2, 1)
     turns = detour([1.0, 1.0]) + np.array([0.0, 2 * np.pi])[:, None, None]
     assert cluster(FLAT, turns).any()
     assert not cluster(circle, turns).any()

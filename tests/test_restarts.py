@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.tree_util import register_dataclass
 
 from mjx_drax import DraxError, Langevin, Restarts, from_function, from_program, minimize, restarts
 from mjx_drax.dynamics import FunctionDynamics
 from mjx_drax.langevin import Info, State
+from mjx_drax.pytrees import register_dataclass
 from mjx_drax.restarts import Attempt, run
 from mjx_drax.solution import solve
 

@@ -18,11 +18,10 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
-from mjx_drax.dynamics import Static
 from mjx_drax.peers.shooting import Plan
+from mjx_drax.pytrees import Static, register_dataclass
 
 
 @register_dataclass

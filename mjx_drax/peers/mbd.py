@@ -25,10 +25,10 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.peers.shooting import Plan, average
+from mjx_drax.pytrees import register_dataclass
 
 
 @register_dataclass

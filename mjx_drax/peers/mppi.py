@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.peers.shooting import Plan, average
+from mjx_drax.pytrees import register_dataclass
 
 
 @register_dataclass

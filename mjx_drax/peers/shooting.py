@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import register_dataclass
 from jax.typing import ArrayLike
 
 from mjx_drax.errors import DraxError
 from mjx_drax.problem import Problem, Trajectory
+from mjx_drax.pytrees import register_dataclass
 
 REPORTS = 25
 """Times at which the cheapest rollouts are looked at."""

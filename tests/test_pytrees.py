@@ -1,0 +1,71 @@
+"""Structures of different classes differ, so no compiled program is taken for another's."""
+
+from dataclasses import dataclass, field
+
+import jax
+import pytest
+
+from mjx_drax import Projection, Reflection
+from mjx_drax.dynamics import FunctionDynamics, as_partial
+from mjx_drax.pytrees import Static, register_dataclass
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class One:
+    x: float
+    n: int = field(metadata=Static)
+    y: tuple[float, ...]
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Other(One):
+    kinked = True
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Kinked(FunctionDynamics):
+    kinked = True
+
+
+SYSTEM = as_partial(lambda x, u: x + u), 0.1, 1, 1
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (One(1.0, 2, (3.0,)), Other(1.0, 2, (3.0,))),
+        (One(1.0, 2, (3.0,)), One(1.0, 3, (3.0,))),
+        (Projection(), Reflection()),
+        (FunctionDynamics(*SYSTEM), Kinked(*SYSTEM)),
+    ],
+    ids=["classes", "static fields", "bounds", "dynamics"],
+)
+def test_structures_of_two_classes_differ(one, other):
+    """Equal ones with different hashes would still be found for one another, now and then."""
+    structures = [jax.tree.structure(node) for node in (one, other)]
+    assert structures[0] != structures[1]
+    assert structures[0] == jax.tree.structure(one)
+
+
+def test_leaves_have_the_names_of_their_fields_and_make_the_same_object_again():
+    node = One(1.0, 2, (3.0, 4.0))
+    leaves, structure = jax.tree_util.tree_flatten_with_path(node)
+    assert [(jax.tree_util.keystr(path), leaf) for path, leaf in leaves] == [
+        (".x", 1.0),
+        (".y[0]", 3.0),
+        (".y[1]", 4.0),
+    ]
+    assert jax.tree.unflatten(structure, [leaf for _, leaf in leaves]) == node
+    assert jax.tree.map(lambda leaf: 2 * leaf, node) == One(2.0, 2, (6.0, 8.0))
+
+
+def test_a_compiled_function_answers_for_each_of_many_classes():
+    """With JAX's own decorator some ten of a hundred classes get another's answer."""
+    answer = jax.jit(lambda node: node.number + 0.0 * node.x)
+    for number in range(100):
+        body = {"__annotations__": {"x": float}, "number": number}
+        cls = register_dataclass(dataclass(frozen=True)(type("Numbered", (), body)))
+        assert answer(cls(1.0)) == number
