@@ -436,8 +436,9 @@ class _Search:
         key = jax.random.key(self.seed)
         key_knots, key_noise = jax.random.split(jax.random.fold_in(key, attempt))
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
-        if attempt == 0 and not hasattr(self.problem.dynamics, "mj_model"):
-            _require_sound(flow, self.problem, knots)  # takes long for models: when they fail
+        if attempt == 0:  # f of models, which compiles for long, is tried if they fail
+            of_model = hasattr(self.problem.dynamics, "mj_model")
+            _require_sound(flow, self.problem, knots, with_f=not of_model)
         state = _init(flow, self.problem, knots, key_noise)
         if self.checkpoint is not None and self.checkpoint.found is not None and attempt == 0:
             return state, undiagnosed(state)  # it will be replaced; an answer needs no compiling
@@ -697,7 +698,9 @@ def _require_finite(flow: Langevin, problem: Problem, state: State, info: Info) 
             )
 
 
-def _require_sound(flow: Langevin, problem: Problem, knots: Trajectory) -> None:
+def _require_sound(
+    flow: Langevin, problem: Problem, knots: Trajectory, with_f: bool = True
+) -> None:
     """Complain about a function that is finite, with its derivatives, for no chain's knots.
 
     Those of a stage are tried at x_init, where every chain stays, and its first control; those of
@@ -707,10 +710,10 @@ def _require_sound(flow: Langevin, problem: Problem, knots: Trajectory) -> None:
         DraxError: naming the function, where it fails and the fix.
     """
     flow = replace(flow, scale=Scale())  # of one type, measured or not
-    finite = _soundness(flow, problem, knots, flow.forward(problem))
+    finite = _soundness(flow, problem, knots, flow.forward(problem), with_f)
     for label, *_ in functions_of(problem):
         for what, good in zip(
-            ("value", "derivative", "second derivative"), finite[label], strict=False
+            ("value", "derivative", "second derivative"), finite.get(label, []), strict=False
         ):
             if not np.asarray(good).any():
                 at = "the initial points"
@@ -723,9 +726,9 @@ def _require_sound(flow: Langevin, problem: Problem, knots: Trajectory) -> None:
                 )
 
 
-@partial(jax.jit, static_argnames="exact")
+@partial(jax.jit, static_argnames=("exact", "with_f"))
 def _soundness(
-    flow: Langevin, problem: Problem, knots: Trajectory, exact: bool
+    flow: Langevin, problem: Problem, knots: Trajectory, exact: bool, with_f: bool
 ) -> dict[str, list[Array]]:
     """Whether functions, first and second derivatives are finite, (chains,) each.
 
@@ -736,12 +739,13 @@ def _soundness(
     start = jnp.broadcast_to(problem.x_init, (len(u), problem.dynamics.nx))
     found = {}
     for label, function, arguments, _ in functions_of(problem):
-        orders = [_of_knot(problem, function, len(arguments) == 1)]
-        if exact:
-            orders.append(_slope(orders[0]))
-            orders.append(_slope(orders[1]) if label.endswith("cost") else orders[1])
-        z = jnp.concatenate([inside.x[:, -1] if len(arguments) == 1 else start, u], axis=1)
-        found[label] = [jax.vmap(lambda z, f=f: jnp.isfinite(f(z)).all())(z) for f in orders]
+        if function == problem.dynamics.step and not with_f:
+            continue
+        at_end = len(arguments) == 1
+        z = jnp.concatenate([inside.x[:, -1] if at_end else start, u], axis=1)
+        order = (2 if label.endswith("cost") else 1) if exact else 0
+        orders = jax.vmap(_with_slopes(_of_knot(problem, function, at_end), order))(z)
+        found[label] = [jnp.isfinite(each).reshape(len(u), -1).all(axis=1) for each in orders]
     return found
 
 
@@ -762,6 +766,16 @@ def _of_knot(
     return value
 
 
-def _slope(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """The derivative along (1, ..., 1)."""
-    return lambda z: jax.jvp(function, (z,), (jnp.ones_like(z),))[1]
+def _with_slopes(
+    function: Callable[[Array], Array], order: int
+) -> Callable[[Array], tuple[Array, ...]]:
+    """The function and its derivatives along (1, ..., 1), up to an order."""
+    if order == 0:
+        return lambda z: (function(z),)
+    lower = _with_slopes(function, order - 1)
+
+    def slopes(z: Array) -> tuple[Array, ...]:
+        values, changes = jax.jvp(lower, (z,), (jnp.ones_like(z),))
+        return *values, changes[-1]
+
+    return slopes

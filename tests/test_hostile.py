@@ -6,9 +6,7 @@ library cannot find out, and so is not here:
 
 - a cost that reads a global which changes after the solve has compiled it: JAX keeps what it read;
 - a cost that is wrong in one region of the state space only: its chains diverge, and are marked;
-- a cost that never returns, or a file that changes while it is read;
-- derivatives of a model's costs that are not finite at x_init are found after compilation, because
-  nothing short of compiling MJX evaluates them; those of functions are found before.
+- a cost that never returns, or a file that changes while it is read.
 """
 
 import functools
@@ -540,6 +538,10 @@ COSTS = [
      "terminal_cost returned a"),
     ("model-method", lambda at: robot(terminal_cost=lambda data: data.body("link").xpos[0]),
      "terminal_cost failed"),
+    ("model-log", lambda at: solve(robot(terminal_cost=lambda data: jnp.log(data.qpos[0] - 9)), 1),
+     "value of terminal_cost", "last initial state"),
+    ("model-sqrt", lambda at: solve(robot(running_cost=lambda data, u: jnp.sqrt(data.qvel[0])), 1),
+     "derivative of running_cost", "x_init"),
     ("model-rounds",
      lambda at: solve(robot(running_cost=lambda data, u: jnp.floor(data.qpos[0])), 1),
      "zero everywhere"),

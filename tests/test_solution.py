@@ -59,6 +59,10 @@ def near(x):
 
 QUICK = Langevin(iterations=40, tail=40)
 
+POINT = """<mujoco><worldbody>
+  <body><joint name="slide" type="slide"/><geom size="0.1"/></body></worldbody>
+<actuator><motor joint="slide" ctrlrange="-1 1"/></actuator></mujoco>"""
+
 
 def rollout(problem, u):
     """States (chains, K + 1, nx) of f under controls (chains, K, nu), in numpy's float64."""
@@ -319,6 +323,20 @@ def test_a_cost_or_dynamics_that_are_nan_everywhere_are_refused(no_compilation):
     ):
         with pytest.raises(DraxError, match=f"the value of {label} is not finite at"):
             solve(reach(**part), chains=3, solver=QUICK)
+
+
+def test_a_models_cost_that_is_nan_everywhere_is_refused(no_compilation):
+    for cost, words in (
+        (
+            lambda data, u: jnp.log(data.qvel[0]),
+            "the value of running_cost is not finite at x_init",
+        ),
+        (lambda data, u: jnp.sqrt(data.qvel[0]), "the derivative of running_cost"),
+        (lambda data, u: jnp.abs(data.qvel[0]) ** 1.5, "the second derivative of running_cost"),
+    ):
+        problem = from_mjcf(POINT, horizon=0.1, running_cost=cost)
+        with pytest.raises(DraxError, match=words):
+            solve(problem, chains=3, solver=QUICK)
 
 
 def test_a_chain_whose_cost_is_nan_is_diverged_and_never_best():
