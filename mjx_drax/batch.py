@@ -23,6 +23,7 @@ from jax.sharding import Mesh
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
+from mjx_drax.compilation import compiled
 from mjx_drax.devices import gathered, mesh_for, spread
 from mjx_drax.errors import DraxError, reason, require_whole, shown
 from mjx_drax.functions import plain, require_functions
@@ -508,7 +509,7 @@ def _worth(family: Family, knots: Trajectory) -> tuple[Array, Array]:
     return family.over(worth)(family.problem, knots)
 
 
-@partial(jax.jit, static_argnames="tail")
+@partial(compiled, static_argnames="tail")
 def _flowed(
     flow: Langevin,
     family: Family,

@@ -34,6 +34,7 @@ from jax import Array
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
 
+from mjx_drax.compilation import compiled
 from mjx_drax.errors import (
     DraxError,
     is_number,
@@ -422,7 +423,7 @@ def _rows(state: State, which: ArrayLike) -> State:
     return jax.tree.map(lambda a: a[which], state)
 
 
-@partial(jax.jit, static_argnames="explorers")
+@partial(compiled, static_argnames="explorers")
 @exact
 def _plan(
     flow: Langevin,

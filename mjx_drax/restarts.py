@@ -33,6 +33,7 @@ from jax.sharding import Mesh
 from jax.typing import ArrayLike
 
 from mjx_drax.checkpoint import Checkpoint, digest, facts
+from mjx_drax.compilation import compiled
 from mjx_drax.devices import gathered, mesh_for, spread
 from mjx_drax.errors import DraxError, require_not_negative, require_whole, shown
 from mjx_drax.functions import require_functions
@@ -563,7 +564,7 @@ class _Search:
         return usual if self.recorder is None else min(usual, self.recorder.every)
 
 
-@partial(jax.jit, static_argnames="tail")
+@partial(compiled, static_argnames="tail")
 def _advance(
     state: State,
     flow: Langevin,
