@@ -55,7 +55,7 @@ GPU_CHAINS = {
 GPU_PROBES = 1
 """Interrupted solves for one row of the suite `gpu`: its replays take longer than its solves."""
 
-DEVICE_CHAINS = {"pendulum": 262_144, "acrobot_swingup": 8_192}
+DEVICE_CHAINS = {"pendulum": 262_144, "acrobot_swingup": 65_536}
 """Tasks of the suite `devices`, and their chains: so many that each device has much to do."""
 
 PEER_TASKS = ("pendulum", "bug_trap", "deep_trap", "cartpole_swingup", "acrobot_swingup")

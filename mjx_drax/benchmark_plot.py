@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -105,7 +106,7 @@ def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> 
     axes.grid(True, color="0.9", lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     if failed:
-        label = "never: " + ", ".join(failed)
+        label = fill("never: " + ", ".join(failed), 30)  # beside the title, on two lines if long
         axes.set_title(label, loc="right", fontsize=7)
 
 
