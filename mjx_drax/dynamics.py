@@ -123,12 +123,19 @@ def as_partial(function: Callable[..., Any]) -> Partial:
     if isinstance(function, Partial):
         return function
     if not jax.tree_util.all_leaves([function]):
-        return Partial(_call, function)
+        cls: Any = type(function)
+        return Partial(_call_of(cls), function)
     return Partial(function)
 
 
-def _call(function: Callable[..., Any], *arguments: Any) -> Any:
-    return function(*arguments)
+@lru_cache
+def _call_of(cls: type) -> Callable[..., Any]:
+    """What calls objects of one class: of two classes the structures may be equal, this is not."""
+
+    def call(function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments)
+
+    return call
 
 
 @register_dataclass

@@ -5,6 +5,7 @@ Environment variables, so that the programs which the tests start have the same 
 
 import importlib.util
 import os
+import sys
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -15,6 +16,11 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_caches / "mjx_drax" / "j
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
+# Most of the default tests' time goes into compilation: a third less without LLVM's optimizations
+# (XLA's own stay). The long tests compute more than they compile.
+if not any("slow" in word for word in sys.argv):
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import pytest  # noqa: E402
@@ -24,6 +30,7 @@ for _option, _value in {
     "jax_compilation_cache_dir": os.environ["JAX_COMPILATION_CACHE_DIR"],
     "jax_persistent_cache_min_compile_time_secs": 0.2,
     "jax_persistent_cache_min_entry_size_bytes": 0,
+    "jax_disable_most_optimizations": os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") == "1",
 }.items():
     jax.config.update(_option, _value)
 

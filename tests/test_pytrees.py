@@ -50,6 +50,20 @@ def test_structures_of_two_classes_differ(one, other):
     assert structures[0] == jax.tree.structure(one)
 
 
+def test_costs_of_two_classes_differ_even_if_jax_registered_them():
+    class Near:
+        def __call__(self, x, u):
+            return x
+
+    class Far(Near):
+        pass
+
+    for cls in (Near, Far):
+        jax.tree_util.register_dataclass(cls, [], [])  # noqa: TID251 - as users do
+    near, other, far = (jax.tree.structure(as_partial(cls())) for cls in (Near, Near, Far))
+    assert near == other != far
+
+
 def test_leaves_have_the_names_of_their_fields_and_make_the_same_object_again():
     node = One(1.0, 2, (3.0, 4.0))
     leaves, structure = jax.tree_util.tree_flatten_with_path(node)
