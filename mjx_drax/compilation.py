@@ -9,8 +9,8 @@ from typing import Any
 import jax
 
 GPU_OPTIONS = {"xla_gpu_experimental_enable_fusion_autotuner": False}
-"""XLA would try several ways to compile each fusion, on the GPU: two thirds of the compilation of a
-contact model, and solves are as fast without."""
+"""XLA would try several ways to compile each fusion, on the GPU: up to two thirds of the time that
+a contact model compiles, and solves are as fast without."""
 
 
 @lru_cache

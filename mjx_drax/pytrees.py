@@ -24,6 +24,7 @@ def register_dataclass(cls: Class) -> Class:
     """
     traced = [field.name for field in fields(cls) if not field.metadata.get("static")]
     static = [field.name for field in fields(cls) if field.metadata.get("static")]
+    names = [*traced, *static]
     keys = [jax.tree_util.GetAttrKey(name) for name in traced]
 
     def flatten(node: Any) -> tuple[list[Any], tuple[Any, ...]]:
@@ -34,9 +35,7 @@ def register_dataclass(cls: Class) -> Class:
         return list(zip(keys, leaves, strict=True)), aside
 
     def unflatten(aside: tuple[Any, ...], leaves: Iterable[Any]) -> Any:
-        return cls(
-            **dict(zip(traced, leaves, strict=True)), **dict(zip(static, aside, strict=True))
-        )
+        return cls(**dict(zip(names, (*leaves, *aside), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls

@@ -437,11 +437,12 @@ class _Search:
         key = jax.random.key(self.seed)
         key_knots, key_noise = jax.random.split(jax.random.fold_in(key, attempt))
         knots = initial_knots(self.problem, self.chains, self.guess, key_knots)
-        if attempt == 0:  # f of models, which compiles for long, is tried if they fail
+        saved = self.checkpoint is not None and self.checkpoint.found is not None
+        if attempt == 0 and not saved:  # f of models, which compiles for long, if they fail
             of_model = hasattr(self.problem.dynamics, "mj_model")
             _require_sound(flow, self.problem, knots, with_f=not of_model)
         state = _init(flow, self.problem, knots, key_noise)
-        if self.checkpoint is not None and self.checkpoint.found is not None and attempt == 0:
+        if attempt == 0 and saved:
             return state, undiagnosed(state)  # it will be replaced; an answer needs no compiling
         _, info = self._advanced(flow, state, 0, 0, int(flow.tail) > 0)
         return jax.block_until_ready((state, info))

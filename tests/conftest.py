@@ -16,8 +16,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_caches / "mjx_drax" / "j
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
-# Most of the default tests' time goes into compilation: a third less without LLVM's optimizations
-# (XLA's own stay). The long tests compute more than they compile.
+# Most of the default tests' time goes into compilation: a fifth to a third less without LLVM's
+# optimizations (XLA's own stay). The long tests compute more than they compile.
 if not any("slow" in word for word in sys.argv):
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 

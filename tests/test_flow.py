@@ -136,13 +136,14 @@ def test_states_are_damped_less_where_f_has_kinks():
     assert compiled[0] == compiled[1]
 
 
-def test_one_loop_advances_and_evaluates_as_two_calls_do():
+@pytest.mark.parametrize("noisy", [0, 2])
+def test_one_loop_advances_and_evaluates_as_two_calls_do(noisy):
     problem = program()
     f = problem.dynamics
     kinked = replace(problem, dynamics=Kinked(f.function, f.dt, f.nx, f.nu))
-    solver = Langevin(iterations=2, tail=4)
+    solver = Langevin(iterations=noisy, tail=4)
     state = start(solver, kinked)
-    for first, last in ((0, 0), (0, 3), (0, 6)):
+    for first, last in ((0, 0), (0, 3), (0, 4 + noisy)):
         moved, info = advance_and_evaluate(solver, kinked, state, first, last)
         expected = advance(solver, kinked, state, first, last)
         np.testing.assert_allclose(z(moved), z(expected), rtol=1e-12)
