@@ -14,7 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import mjx_drax
-from mjx_drax import check, guesses, optima, plotting, portraits, program, settings, solution
+from mjx_drax import guesses
+from mjx_drax.physics import check
+from mjx_drax.search import settings
+from mjx_drax.solution import optima, program, solution
+from mjx_drax.view import plotting, portraits
 
 PAGE = Path(__file__).with_name("api.md")
 

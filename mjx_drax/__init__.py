@@ -10,98 +10,96 @@ Names are loaded when they are first used, so that importing the package costs n
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjx_drax import _checkout as _checkout
+
 if TYPE_CHECKING:
-    from mjx_drax import guesses as guesses
-    from mjx_drax.background import Background as Background
-    from mjx_drax.batch import BatchSolution as BatchSolution
-    from mjx_drax.batch import solve_batch as solve_batch
-    from mjx_drax.bounds import LogBarrier as LogBarrier
-    from mjx_drax.bounds import Projection as Projection
-    from mjx_drax.bounds import Reflection as Reflection
-    from mjx_drax.browser import save_html as save_html
-    from mjx_drax.derivatives import Autodiff as Autodiff
-    from mjx_drax.derivatives import Smoothed as Smoothed
-    from mjx_drax.errors import DraxError as DraxError
-    from mjx_drax.export import export_keyframes as export_keyframes
-    from mjx_drax.export import save_csv as save_csv
-    from mjx_drax.export import save_dataset as save_dataset
-    from mjx_drax.film import render_diffusion as render_diffusion
-    from mjx_drax.ghosts import render_timelapse as render_timelapse
-    from mjx_drax.langevin import Langevin as Langevin
-    from mjx_drax.mjcf import from_mjcf as from_mjcf
-    from mjx_drax.mpc import MPC as MPC
-    from mjx_drax.plant import Plant as Plant
-    from mjx_drax.plant import Push as Push
-    from mjx_drax.precondition import Diagonal as Diagonal
-    from mjx_drax.precondition import GaussNewton as GaussNewton
-    from mjx_drax.precondition import Identity as Identity
-    from mjx_drax.problem import Problem as Problem
-    from mjx_drax.problem import Trajectory as Trajectory
-    from mjx_drax.problem import from_function as from_function
-    from mjx_drax.program import from_program as from_program
-    from mjx_drax.program import minimize as minimize
-    from mjx_drax.quasi_newton import LBFGS as LBFGS
-    from mjx_drax.rendering import render as render
-    from mjx_drax.restarts import Restarts as Restarts
-    from mjx_drax.schedules import Constant as Constant
-    from mjx_drax.schedules import Geometric as Geometric
-    from mjx_drax.solution import Solution as Solution
-    from mjx_drax.solution import solve as solve
-    from mjx_drax.terms import Terms as Terms
+    from mjx_drax.base.errors import DraxError as DraxError
+    from mjx_drax.control.background import Background as Background
+    from mjx_drax.control.mpc import MPC as MPC
+    from mjx_drax.control.plant import Plant as Plant
+    from mjx_drax.control.plant import Push as Push
+    from mjx_drax.method.bounds import LogBarrier as LogBarrier
+    from mjx_drax.method.bounds import Projection as Projection
+    from mjx_drax.method.bounds import Reflection as Reflection
+    from mjx_drax.method.langevin import Langevin as Langevin
+    from mjx_drax.method.metrics import Diagonal as Diagonal
+    from mjx_drax.method.metrics import GaussNewton as GaussNewton
+    from mjx_drax.method.metrics import Identity as Identity
+    from mjx_drax.method.quasi_newton import LBFGS as LBFGS
+    from mjx_drax.method.schedules import Constant as Constant
+    from mjx_drax.method.schedules import Geometric as Geometric
+    from mjx_drax.modelling import guesses as guesses
+    from mjx_drax.modelling.terms import Terms as Terms
+    from mjx_drax.physics.mjcf import from_mjcf as from_mjcf
+    from mjx_drax.problem.differentiators import Autodiff as Autodiff
+    from mjx_drax.problem.differentiators import Smoothed as Smoothed
+    from mjx_drax.problem.problem import Problem as Problem
+    from mjx_drax.problem.problem import Trajectory as Trajectory
+    from mjx_drax.problem.problem import from_function as from_function
+    from mjx_drax.search.restarts import Restarts as Restarts
+    from mjx_drax.solution.batch import BatchSolution as BatchSolution
+    from mjx_drax.solution.batch import solve_batch as solve_batch
+    from mjx_drax.solution.export import export_keyframes as export_keyframes
+    from mjx_drax.solution.export import save_csv as save_csv
+    from mjx_drax.solution.export import save_dataset as save_dataset
+    from mjx_drax.solution.program import from_program as from_program
+    from mjx_drax.solution.program import minimize as minimize
+    from mjx_drax.solution.solution import Solution as Solution
+    from mjx_drax.solution.solution import solve as solve
+    from mjx_drax.view.browser import save_html as save_html
+    from mjx_drax.view.film import render_diffusion as render_diffusion
+    from mjx_drax.view.rendering import render as render
+    from mjx_drax.view.timelapse import render_timelapse as render_timelapse
 
 __version__ = "0.1.0"
 
 _HOME = {
-    "BatchSolution": "batch",
-    "solve_batch": "batch",
-    "Background": "background",
-    "MPC": "mpc",
-    "Plant": "plant",
-    "Push": "plant",
-    "LogBarrier": "bounds",
-    "DraxError": "errors",
-    "export_keyframes": "export",
-    "save_csv": "export",
-    "save_dataset": "export",
-    "save_html": "browser",
-    "Langevin": "langevin",
-    "from_mjcf": "mjcf",
-    "GaussNewton": "precondition",
-    "Diagonal": "precondition",
-    "Identity": "precondition",
-    "LBFGS": "quasi_newton",
-    "Projection": "bounds",
-    "Reflection": "bounds",
-    "Autodiff": "derivatives",
-    "Smoothed": "derivatives",
-    "from_program": "program",
-    "minimize": "program",
-    "Problem": "problem",
-    "Trajectory": "problem",
-    "from_function": "problem",
-    "render": "rendering",
-    "render_diffusion": "film",
-    "render_timelapse": "ghosts",
-    "Restarts": "restarts",
-    "Constant": "schedules",
-    "Geometric": "schedules",
-    "Solution": "solution",
-    "solve": "solution",
-    "Terms": "terms",
+    "BatchSolution": "solution.batch",
+    "solve_batch": "solution.batch",
+    "Background": "control.background",
+    "MPC": "control.mpc",
+    "Plant": "control.plant",
+    "Push": "control.plant",
+    "LogBarrier": "method.bounds",
+    "DraxError": "base.errors",
+    "export_keyframes": "solution.export",
+    "save_csv": "solution.export",
+    "save_dataset": "solution.export",
+    "save_html": "view.browser",
+    "Langevin": "method.langevin",
+    "from_mjcf": "physics.mjcf",
+    "GaussNewton": "method.metrics",
+    "Diagonal": "method.metrics",
+    "Identity": "method.metrics",
+    "LBFGS": "method.quasi_newton",
+    "Projection": "method.bounds",
+    "Reflection": "method.bounds",
+    "Autodiff": "problem.differentiators",
+    "Smoothed": "problem.differentiators",
+    "from_program": "solution.program",
+    "minimize": "solution.program",
+    "Problem": "problem.problem",
+    "Trajectory": "problem.problem",
+    "from_function": "problem.problem",
+    "render": "view.rendering",
+    "render_diffusion": "view.film",
+    "render_timelapse": "view.timelapse",
+    "Restarts": "search.restarts",
+    "Constant": "method.schedules",
+    "Geometric": "method.schedules",
+    "Solution": "solution.solution",
+    "solve": "solution.solution",
+    "Terms": "modelling.terms",
 }
 
 __all__ = sorted([*_HOME, "guesses"])
 
-if not (Path(__file__).parent / "tasks").is_dir():  # a checkout: tasks and models lie beside us
-    __path__.append(str(Path(__file__).parents[1]))
-
 
 def __getattr__(name: str) -> Any:
     if name == "guesses":
-        return import_module("mjx_drax.guesses")
+        return import_module("mjx_drax.modelling.guesses")
     if name not in _HOME:
         raise AttributeError(f"module 'mjx_drax' has no attribute {name!r}")
     value = getattr(import_module(f"mjx_drax.{_HOME[name]}"), name)

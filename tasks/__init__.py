@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from mjx_drax.errors import DraxError
+from mjx_drax.base.errors import DraxError
 
 
 def names() -> list[str]:

@@ -12,9 +12,9 @@ from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax import Problem, Terms, Trajectory, from_mjcf, guesses
-from mjx_drax.mjcf import load
+from mjx_drax.method.metrics import displaced
 from mjx_drax.models import path
-from mjx_drax.precondition import displaced
+from mjx_drax.physics.mjcf import load
 
 DT = 0.04  # [s]
 GOAL = np.array([2.5, 0.0, 1.0])  # [m]

@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 
 from mjx_drax import Problem, from_mjcf
-from mjx_drax.mjcf import load
 from mjx_drax.models import path
+from mjx_drax.physics.mjcf import load
 
 DT = 0.02  # [s]
 AHEAD = np.array([0.3, 0.0])  # [m]

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
-from mjx_drax import (
-    DraxError,
-    Langevin,
-    Restarts,
-    batch,
-    from_function,
-    from_mjcf,
-    solve_batch,
-)
+from mjx_drax import DraxError, Langevin, Restarts, from_function, from_mjcf, solve_batch
+from mjx_drax.solution import batch
 
 DT = 0.1
 SOLVER = Restarts(replace(Restarts().flow, iterations=30, tail=20), descent=20, attempts=3)

@@ -9,23 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import (
-    DraxError,
-    Geometric,
-    Langevin,
-    Restarts,
-    benchmark,
-    from_function,
-    measure,
-    tasks,
-)
-from mjx_drax.benchmark_plot import pooled
+from mjx_drax import DraxError, Geometric, Langevin, Restarts, from_function, tasks
 from mjx_drax.cli import main
-from mjx_drax.peers import shooting
-from mjx_drax.peers.cem import CEM
-from mjx_drax.peers.ipopt import FUNCTIONS, Transcription
-from mjx_drax.peers.mbd import MBD
-from mjx_drax.peers.mppi import MPPI
+from mjx_drax.studies import benchmark
+from mjx_drax.studies import measurements as measure
+from mjx_drax.studies.benchmark_plot import pooled
+from mjx_drax.studies.peers import shooting
+from mjx_drax.studies.peers.cem import CEM
+from mjx_drax.studies.peers.ipopt import FUNCTIONS, Transcription
+from mjx_drax.studies.peers.mbd import MBD
+from mjx_drax.studies.peers.mppi import MPPI
 
 DT, KNOTS = 0.1, 20
 METHODS = [

@@ -18,8 +18,8 @@ from mjx_drax import (
     from_function,
     solve,
 )
-from mjx_drax.bounds import FOLLOW
-from mjx_drax.problem import Box, box
+from mjx_drax.method.bounds import FOLLOW
+from mjx_drax.problem.problem import Box, box
 
 K, NX, NU = 5, 3, 2
 INF = np.inf

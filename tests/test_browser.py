@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, save_html
-from mjx_drax.browser import require_viewer
-from mjx_drax.host import set_state
+from mjx_drax.physics.states import set_state
 from mjx_drax.tasks import load
+from mjx_drax.view.browser import require_viewer
 
 
 @pytest.fixture(scope="module")

@@ -17,16 +17,15 @@ from mjx_drax import (
     Langevin,
     Restarts,
     Trajectory,
-    checkpoint,
     from_function,
     from_mjcf,
-    restarts,
     solve,
     solve_batch,
 )
-from mjx_drax.dynamics import FunctionDynamics
-from mjx_drax.errors import DraxWarning
-from mjx_drax.pytrees import register_dataclass
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.problem.dynamics import FunctionDynamics
+from mjx_drax.search import checkpoint, restarts
 
 DT, CHAINS = 0.1, 4
 SOLVER = Restarts(
@@ -221,7 +220,7 @@ def test_what_is_complete_is_not_solved_again(whole, whole_batch, tmp_path, monk
     batch(checkpoint=many)
     written = one.stat().st_mtime_ns, many.stat().st_mtime_ns
     monkeypatch.setattr(restarts._Search, "_advanced", None)
-    monkeypatch.setattr("mjx_drax.batch._Search._chunk", None)
+    monkeypatch.setattr("mjx_drax.solution.batch._Search._chunk", None)
     again = solved(checkpoint=one)
     assert_same(again, whole)
     assert again.solve_time == pytest.approx(first.solve_time, abs=0.1)
@@ -372,7 +371,7 @@ def never(*_):
 def test_what_cannot_be_written_is_refused_before_the_solve(call, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(restarts._Search, "_start", never)
-    monkeypatch.setattr("mjx_drax.batch._Search._begun", never)
+    monkeypatch.setattr("mjx_drax.solution.batch._Search._begun", never)
     with pytest.raises(DraxError, match="Not a directory"):
         call(checkpoint=tmp_path / "file" / "run.ckpt")
     monkeypatch.setattr(os, "posix_fallocate", full)
@@ -407,7 +406,7 @@ PROGRAM = """
 import sys, time
 import numpy as np
 sys.path.insert(0, sys.argv[1])
-from mjx_drax import checkpoint
+from mjx_drax.search import checkpoint
 from test_checkpoint import batch, solved
 checkpoint.EVERY, checkpoint.SHARE = 0.0, np.inf
 def slowly(*_):

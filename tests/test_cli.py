@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Geometric, Solution, cli, tasks
-from mjx_drax.check import text
 from mjx_drax.cli import main
-from mjx_drax.restarts import CHUNK
+from mjx_drax.physics.check import text
+from mjx_drax.search.restarts import CHUNK
 
 COST = """
 import jax.numpy as jnp
@@ -170,7 +170,7 @@ def test_settings_are_set_by_name(tmp_path, capsys):
 
 
 def test_json_is_all_that_is_printed(slider, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("mjx_drax.solution.solve", lambda *_, **__: slider)
+    monkeypatch.setattr("mjx_drax.solution.solution.solve", lambda *_, **__: slider)
     assert main(f"solve pendulum --no-video --json --out {tmp_path}".split()) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["task"] == "slider"
@@ -188,7 +188,9 @@ def test_export_writes_what_is_asked_for(slider, tmp_path, capsys):
 
 
 def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, monkeypatch, without):
-    monkeypatch.setattr("mjx_drax.solution.solve", lambda *_, **__: pytest.fail("it was solved"))
+    monkeypatch.setattr(
+        "mjx_drax.solution.solution.solve", lambda *_, **__: pytest.fail("it was solved")
+    )
     assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--html")
     assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--keyframes")
     without("h5py")
@@ -196,7 +198,9 @@ def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, mon
 
 
 def test_places_that_cannot_be_written_are_refused_before_the_solve(own, capsys, monkeypatch):
-    monkeypatch.setattr("mjx_drax.restarts._Search.run", lambda *_: pytest.fail("it was solved"))
+    monkeypatch.setattr(
+        "mjx_drax.search.restarts._Search.run", lambda *_: pytest.fail("it was solved")
+    )
     (own / "file").touch()
     short, inside = (
         ["solve", "pendulum_swingup", "--out", str(own / "out")],
@@ -221,7 +225,7 @@ def test_a_checkpoint_is_gone_on_from(tmp_path, capsys, monkeypatch):
     main(arguments)
     assert "going on" not in capsys.readouterr().out
     first = Solution.load(tmp_path)
-    monkeypatch.setattr("mjx_drax.restarts._Search._advanced", None)
+    monkeypatch.setattr("mjx_drax.search.restarts._Search._advanced", None)
     main(arguments)
     assert f"going on from {file}\n" in capsys.readouterr().out
     np.testing.assert_array_equal(Solution.load(tmp_path).trajectories.u, first.trajectories.u)

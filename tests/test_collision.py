@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_drax._mjx import COLLISIONS, mjx
-from mjx_drax.collision import CORNERS, collision, plane_box
-from mjx_drax.twin import twin
+from mjx_drax.physics._mjx import COLLISIONS, mjx
+from mjx_drax.physics.collision import CORNERS, collision, plane_box
+from mjx_drax.physics.mjx_model import twin
 
 BOX = """
 <mujoco>

@@ -3,8 +3,8 @@
 import jax
 import pytest
 
-from mjx_drax import compilation
-from mjx_drax.compilation import compiled
+from mjx_drax.kernels import compilation
+from mjx_drax.kernels.compilation import compiled
 
 
 @pytest.fixture(autouse=True)

@@ -11,17 +11,17 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
 from mjx_drax import Constant, GaussNewton, Langevin, LogBarrier, Trajectory, from_function, solve
-from mjx_drax.bounds import Projection
-from mjx_drax.constraints import eliminate, recover
-from mjx_drax.langevin import advance
-from mjx_drax.precondition import (
+from mjx_drax.method.bounds import Projection
+from mjx_drax.method.constraints import eliminate, recover
+from mjx_drax.method.langevin import advance
+from mjx_drax.method.metrics import (
     Levels,
     Multipliers,
     augmented_lagrangian,
     residuals,
 )
-from mjx_drax.problem import Stagewise
-from mjx_drax.program import from_program, minimize
+from mjx_drax.problem.problem import Stagewise
+from mjx_drax.solution.program import from_program, minimize
 
 
 @pytest.fixture(autouse=True)

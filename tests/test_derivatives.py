@@ -10,10 +10,10 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import norm
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, from_function, solve
-from mjx_drax.bounds import LogBarrier
-from mjx_drax.derivatives import Autodiff, Smoothed
-from mjx_drax.precondition import Levels, Multipliers
-from mjx_drax.problem import Stagewise, Trajectory
+from mjx_drax.method.bounds import LogBarrier
+from mjx_drax.method.metrics import Levels, Multipliers
+from mjx_drax.problem.differentiators import Autodiff, Smoothed
+from mjx_drax.problem.problem import Stagewise, Trajectory
 
 N, M = 8, 5
 W = np.random.default_rng(0).normal(size=(M, N)) / N**0.5

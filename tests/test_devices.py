@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError
-from mjx_drax.devices import mesh_for
+from mjx_drax.search.devices import mesh_for
 
 PROBLEM = """
 from dataclasses import replace
 import jax.numpy as jnp, numpy as np, pytest
-from mjx_drax import DraxError, Restarts, checkpoint, from_function, from_mjcf, solve, solve_batch
+from mjx_drax import DraxError, Restarts, from_function, from_mjcf, solve, solve_batch
+from mjx_drax.search import checkpoint
 
 problem = from_function(
     lambda x, u: x + 0.1 * jnp.array([x[1], u[0] - jnp.sin(x[0])]),
@@ -27,7 +28,7 @@ problem = from_function(
 PROGRAM = """
 import sys, time
 import jax
-from mjx_drax import devices
+from mjx_drax.search import devices
 
 count = int(sys.argv[2])
 assert len(jax.devices()) == count

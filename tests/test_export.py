@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, export_keyframes, from_mjcf, mjcf, save_csv, save_dataset
-from mjx_drax.export import control_names, require_mjcf, state_names
-from mjx_drax.files import complete, require
+from mjx_drax import DraxError, export_keyframes, from_mjcf, save_csv, save_dataset
+from mjx_drax.base.files import complete, require
+from mjx_drax.physics import mjcf
+from mjx_drax.solution.export import control_names, require_mjcf, state_names
 from mjx_drax.tasks import load
 
 SPACE = """

@@ -12,13 +12,16 @@ import pytest
 from matplotlib.axes import Axes
 from PIL import Image
 
-from mjx_drax import film, ghosts, movie, recording, rendering
-from mjx_drax.errors import DraxError
-from mjx_drax.langevin import Langevin
-from mjx_drax.recording import Recorder, Recording, Snapshot, Tries
-from mjx_drax.schedules import Constant
-from mjx_drax.solution import Solution, solve
+from mjx_drax.base.errors import DraxError
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.method.schedules import Constant
+from mjx_drax.search import recording
+from mjx_drax.search.recording import Recorder, Recording, Snapshot, Tries
+from mjx_drax.solution.solution import Solution, solve
 from mjx_drax.tasks import load
+from mjx_drax.view import film, rendering
+from mjx_drax.view import timelapse as ghosts
+from mjx_drax.view import video as movie
 
 SHORT = Langevin(iterations=6, tail=4, noise=Constant(0.1))
 

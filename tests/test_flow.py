@@ -13,10 +13,10 @@ from jax.tree_util import Partial
 from scipy.linalg import block_diag
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, Trajectory, from_function
-from mjx_drax.dynamics import FunctionDynamics
-from mjx_drax.langevin import advance, advance_and_evaluate, evaluate
-from mjx_drax.problem import box
-from mjx_drax.pytrees import register_dataclass
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.langevin import advance, advance_and_evaluate, evaluate
+from mjx_drax.problem.dynamics import FunctionDynamics
+from mjx_drax.problem.problem import box
 
 K, NX, NU = 4, 2, 1
 A = np.array([[1.0, 0.3], [-0.4, 0.9]])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, from_function, from_mjcf, guesses
-from mjx_drax.problem import box
-from mjx_drax.restarts import initial_knots
+from mjx_drax.problem.problem import box
+from mjx_drax.search.restarts import initial_knots
 
 ARM = """
 <mujoco model="arm">

@@ -60,18 +60,18 @@ from mjx_drax import (
     solve_batch,
     tasks,
 )
-from mjx_drax.check import check
-from mjx_drax.export import export_keyframes
-from mjx_drax.loop import simulate
-from mjx_drax.mpc import Plan
-from mjx_drax.optima import distinct
-from mjx_drax.plotting import plot_optima, plot_solution
-from mjx_drax.portraits import plot_phase
-from mjx_drax.precondition import Multipliers
-from mjx_drax.problem import Stagewise
-from mjx_drax.rendering import render_frames
-from mjx_drax.settings import changed, from_data
-from mjx_drax.solution import Replays
+from mjx_drax.control.mpc import Plan
+from mjx_drax.control.trials import simulate
+from mjx_drax.method.metrics import Multipliers
+from mjx_drax.physics.check import check
+from mjx_drax.problem.problem import Stagewise
+from mjx_drax.search.settings import changed, from_data
+from mjx_drax.solution.export import export_keyframes
+from mjx_drax.solution.optima import distinct
+from mjx_drax.solution.solution import Replays
+from mjx_drax.view.plotting import plot_optima, plot_solution
+from mjx_drax.view.portraits import plot_phase
+from mjx_drax.view.rendering import render_frames
 
 INF, NAN = math.inf, math.nan
 
@@ -1140,10 +1140,10 @@ def nothing_iterates(monkeypatch):
     def far(*_, **__):
         pytest.fail("it got as far as iterating")
 
-    monkeypatch.setattr("mjx_drax.restarts._init", far)
-    monkeypatch.setattr("mjx_drax.restarts._advance", far)
-    monkeypatch.setattr("mjx_drax.batch._flowed", far)
-    monkeypatch.setattr("mjx_drax.mpc._plan", far)
+    monkeypatch.setattr("mjx_drax.search.restarts._init", far)
+    monkeypatch.setattr("mjx_drax.search.restarts._advance", far)
+    monkeypatch.setattr("mjx_drax.solution.batch._flowed", far)
+    monkeypatch.setattr("mjx_drax.control.mpc._plan", far)
 
 
 def complaint(call):

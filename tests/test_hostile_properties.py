@@ -27,9 +27,9 @@ from mjx_drax import (
     Trajectory,
     from_function,
 )
-from mjx_drax.mjcf import load
-from mjx_drax.restarts import as_restarts, initial_knots
-from mjx_drax.settings import changed, names
+from mjx_drax.physics.mjcf import load
+from mjx_drax.search.restarts import as_restarts, initial_knots
+from mjx_drax.search.settings import changed, names
 
 bounded = settings(
     max_examples=100,

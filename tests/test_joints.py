@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import quaternion
-from mjx_drax.joints import Joints
+from mjx_drax.physics import quaternion
+from mjx_drax.physics.joints import Joints
 
 MODEL = mujoco.MjModel.from_xml_string("""
 <mujoco><worldbody>

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_drax.linalg import (
+from mjx_drax.kernels.linalg import (
     SUMMED_UP_TO,
     UNROLLED_UP_TO,
     cholesky,

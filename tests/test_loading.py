@@ -16,14 +16,14 @@ from mjx_drax import (
     Langevin,
     Solution,
     from_function,
-    loading,
-    mjcf,
     render,
-    results,
     solve,
 )
-from mjx_drax.errors import DraxWarning
-from mjx_drax.plotting import plot_solution
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.physics import mjcf
+from mjx_drax.solution import load as loading
+from mjx_drax.solution import save as results
+from mjx_drax.view.plotting import plot_solution
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from mjx_drax import LBFGS, Diagonal, DraxError, GaussNewton, Identity, Langevin, from_mjcf, solve
-from mjx_drax.dynamics import Dynamics
-from mjx_drax.joints import Joints
-from mjx_drax.langevin import advance
-from mjx_drax.precondition import Levels, augmented_lagrangian, displaced
-from mjx_drax.problem import Trajectory
-from mjx_drax.pytrees import register_dataclass
-from mjx_drax.terms import Terms
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.langevin import advance
+from mjx_drax.method.metrics import Levels, augmented_lagrangian, displaced
+from mjx_drax.modelling.terms import Terms
+from mjx_drax.physics.joints import Joints
+from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.problem import Trajectory
 
 K = 5
 

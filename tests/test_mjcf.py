@@ -9,13 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Trajectory, from_mjcf, physics
-from mjx_drax.check import check
-from mjx_drax.derivatives import Autodiff
-from mjx_drax.host import difference, set_state
-from mjx_drax.langevin import evaluate
-from mjx_drax.linearize import linearize
+from mjx_drax import DraxError, Trajectory, from_mjcf
+from mjx_drax.method.langevin import evaluate
+from mjx_drax.method.linearize import linearize
 from mjx_drax.models import path
+from mjx_drax.physics import step as physics
+from mjx_drax.physics.check import check
+from mjx_drax.physics.states import difference, set_state
+from mjx_drax.problem.differentiators import Autodiff
 
 MODELS = ["pendulum", "cartpole", "acrobot"]
 K = 8

@@ -20,11 +20,11 @@ from mjx_drax import (
     Restarts,
     from_function,
     from_mjcf,
-    loop,
-    mpc,
 )
 from mjx_drax.cli import main
-from mjx_drax.plant import random_pushes
+from mjx_drax.control import mpc
+from mjx_drax.control import trials as loop
+from mjx_drax.control.plant import random_pushes
 
 DT, K = 0.1, 15
 FAST = Restarts(replace(Restarts().flow, iterations=30, tail=30), descent=40, attempts=1)

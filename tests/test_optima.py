@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mjx_drax import DraxError, Langevin, cli, from_function, optima, plotting, results
+from mjx_drax import DraxError, Langevin, cli, from_function
+from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.cli import _optima, main
-from mjx_drax.dynamics import FunctionDynamics, as_partial
-from mjx_drax.optima import TOLERANCE, cluster, distinct
-from mjx_drax.plotting import plot_optima
-from mjx_drax.pytrees import register_dataclass
-from mjx_drax.solution import solve
+from mjx_drax.problem.dynamics import FunctionDynamics, as_partial
+from mjx_drax.solution import optima
+from mjx_drax.solution import save as results
+from mjx_drax.solution.optima import TOLERANCE, cluster, distinct
+from mjx_drax.solution.solution import solve
+from mjx_drax.view import plotting
+from mjx_drax.view.plotting import plot_optima
 
 K = 40
 PHASE = np.linspace(0, np.pi, K)
@@ -291,7 +294,7 @@ def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
 
 
 def test_the_command_writes_a_picture_only_of_several(tmp_path, capsys, monkeypatch, hill):
-    monkeypatch.setattr("mjx_drax.solution.solve", lambda *_, **__: hill)
+    monkeypatch.setattr("mjx_drax.solution.solution.solve", lambda *_, **__: hill)
     arguments = f"solve pendulum --no-video --out {tmp_path}".split()
     assert main(arguments) == 0
     out = capsys.readouterr().out
@@ -300,7 +303,7 @@ def test_the_command_writes_a_picture_only_of_several(tmp_path, capsys, monkeypa
     assert (tmp_path / "optima.png").stat().st_size > 1000
     (tmp_path / "optima.png").unlink()
     one = failed(hill, hill.optima[1].members)
-    monkeypatch.setattr("mjx_drax.solution.solve", lambda *_, **__: one)
+    monkeypatch.setattr("mjx_drax.solution.solution.solve", lambda *_, **__: one)
     assert main(arguments) == 0
     assert "optima         one" in capsys.readouterr().out
     assert not (tmp_path / "optima.png").exists()

@@ -11,11 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import Autodiff, Smoothed, from_mjcf, host
-from mjx_drax.agreement import Engine
-from mjx_drax.errors import DraxWarning
-from mjx_drax.linearize import linearize
-from mjx_drax.problem import Trajectory
+from mjx_drax import Autodiff, Smoothed, from_mjcf
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.method.linearize import linearize
+from mjx_drax.physics import states as host
+from mjx_drax.physics.agreement import Engine
+from mjx_drax.problem.problem import Trajectory
 
 FLOATING = """
 <mujoco model="floating">

@@ -15,13 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from mjx_drax import plotting, portraits
-from mjx_drax.errors import DraxError
-from mjx_drax.langevin import Langevin
-from mjx_drax.plotting import plot_solution
-from mjx_drax.restarts import Restarts
-from mjx_drax.solution import WITH_FEEDBACK, Solution, solve
+from mjx_drax.base.errors import DraxError
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.search.restarts import Restarts
+from mjx_drax.solution.solution import WITH_FEEDBACK, Solution, solve
 from mjx_drax.tasks import load
+from mjx_drax.view import plotting, portraits
+from mjx_drax.view.plotting import plot_solution
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,8 @@ from mjx_drax import (
     Trajectory,
     from_function,
 )
-from mjx_drax.langevin import advance
-from mjx_drax.program import from_program, minimize
+from mjx_drax.method.langevin import advance
+from mjx_drax.solution.program import from_program, minimize
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,8 @@ import jax
 import pytest
 
 from mjx_drax import Projection, Reflection
-from mjx_drax.dynamics import FunctionDynamics, as_partial
-from mjx_drax.pytrees import Static, register_dataclass
+from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.problem.dynamics import FunctionDynamics, as_partial
 
 
 @register_dataclass

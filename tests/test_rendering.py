@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from mjx_drax import host, rendering
-from mjx_drax.errors import DraxError
-from mjx_drax.langevin import Langevin
-from mjx_drax.restarts import Restarts
-from mjx_drax.solution import Solution, solve
+from mjx_drax.base.errors import DraxError
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.physics import states as host
+from mjx_drax.search.restarts import Restarts
+from mjx_drax.solution.solution import Solution, solve
 from mjx_drax.tasks import load
+from mjx_drax.view import rendering
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, WIDTH = 120, 160
@@ -379,7 +380,7 @@ def _run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
 def test_importing_changes_nothing() -> None:
     result = _run(
         "import os, sys; before = dict(os.environ)\n"
-        "import mjx_drax.rendering\n"
+        "import mjx_drax.view.rendering\n"
         "assert dict(os.environ) == before\n"
         "assert not {'OpenGL', 'mujoco.egl', 'mediapy', 'PIL'} & set(sys.modules)\n"
     )
@@ -401,7 +402,7 @@ def test_missing_libraries_of_a_chosen_backend_are_named(tmp_path: Path) -> None
     # With MUJOCO_GL=egl and no libEGL, `import mujoco` fails as this stand-in does.
     complaint = "'NoneType' object has no attribute 'eglQueryString'"
     (tmp_path / "mujoco.py").write_text(f"raise AttributeError({complaint!r})")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import mjx_drax.rendering"
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import mjx_drax.view.rendering"
     result = _run(code, MUJOCO_GL="egl")
     assert result.returncode != 0
     last = result.stderr.splitlines()[-1]

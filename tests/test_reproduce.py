@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import Constant, reproduce
+from mjx_drax import Constant
+from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import REPRODUCIBLE, main
-from mjx_drax.errors import DraxError
-from mjx_drax.reproduce import EXPERIMENTS, PENDULUM_FLOW, TRAP_FLOW
+from mjx_drax.studies import reproduce
+from mjx_drax.studies.reproduce import EXPERIMENTS, PENDULUM_FLOW, TRAP_FLOW
 
 
 def figure_is_drawn(figure):

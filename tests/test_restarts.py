@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Langevin, Restarts, from_function, from_program, minimize, restarts
-from mjx_drax.dynamics import FunctionDynamics
-from mjx_drax.langevin import Info, State
-from mjx_drax.pytrees import register_dataclass
-from mjx_drax.restarts import Attempt, run
-from mjx_drax.solution import solve
+from mjx_drax import DraxError, Langevin, Restarts, from_function, from_program, minimize
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.langevin import Info, State
+from mjx_drax.problem.dynamics import FunctionDynamics
+from mjx_drax.search import restarts
+from mjx_drax.search.restarts import Attempt, run
+from mjx_drax.solution.solution import solve
 
 DT, K = 0.1, 20
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, solve_discrete_are
 
-from mjx_drax.linearize import Linearization
-from mjx_drax.riccati import QuadraticCost, White, factorize, newton, solve_and_sample
-from mjx_drax.riccati_kernel import newton_batch
+from mjx_drax.kernels.riccati_gpu import newton_batch
+from mjx_drax.method.linearize import Linearization
+from mjx_drax.method.riccati import QuadraticCost, White, factorize, newton, solve_and_sample
 
 K, NDX, NU = 6, 3, 2
 JAX = tuple(map(int, jax.__version__.split(".")[:2]))

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from jax import lax
 
-from mjx_drax import from_mjcf, mjcf, scalar, scalar_kernel
-from mjx_drax.derivatives import Autodiff, InScalars
+from mjx_drax import from_mjcf
+from mjx_drax.kernels import rows as scalar_kernel
+from mjx_drax.kernels import scalarize as scalar
+from mjx_drax.kernels.scalarize import pruned, scalarized
 from mjx_drax.models import path
-from mjx_drax.scalar import pruned, scalarized
+from mjx_drax.physics import mjcf
+from mjx_drax.problem.differentiators import Autodiff, InScalars
 
 RNG = np.random.default_rng(0)
 A = RNG.uniform(0.5, 2.0, (3, 4))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from mjx_drax import Constant, DraxError, Geometric, Identity, Langevin, Restarts, Smoothed
-from mjx_drax.settings import changed, from_data, names, to_data
+from mjx_drax.search.settings import changed, from_data, names, to_data
 
 
 @pytest.mark.parametrize(

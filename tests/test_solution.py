@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf, restarts
-from mjx_drax.langevin import evaluate
-from mjx_drax.restarts import CHUNK
-from mjx_drax.solution import TRACKED, _replays, solve
+from mjx_drax import DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf
+from mjx_drax.method.langevin import evaluate
+from mjx_drax.search import restarts
+from mjx_drax.search.restarts import CHUNK
+from mjx_drax.solution.solution import TRACKED, _replays, solve
 from mjx_drax.tasks import load
 
 OPTIMUM = 0.031774  # of the pendulum: 600 of 600 IPOPT multistarts agree

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from mjx_drax import Constant, DraxError, GaussNewton, Geometric, Identity, Langevin, LogBarrier
-from mjx_drax.bounds import Projection, Reflection
-from mjx_drax.langevin import advance
-from mjx_drax.problem import Trajectory, box
-from mjx_drax.program import from_program, minimize
+from mjx_drax.method.bounds import Projection, Reflection
+from mjx_drax.method.langevin import advance
+from mjx_drax.problem.problem import Trajectory, box
+from mjx_drax.solution.program import from_program, minimize
 
 Q = np.array([[2.0, 1.2], [1.2, 1.0]])
 CENTRE = np.array([1.0, -2.0])

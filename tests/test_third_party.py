@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError
+from mjx_drax.modelling.postures import NEAR, reach
 from mjx_drax.models import path
-from mjx_drax.postures import NEAR, reach
-from mjx_drax.third_party import FOLDERS, fine, line, main, measure_apart, models
+from mjx_drax.studies.third_party import FOLDERS, fine, line, main, measure_apart, models
 
 SMALL = [
     "dm_control/ball_in_cup",
@@ -27,7 +27,7 @@ SMALL = [
     "gymnasium/reacher",
     "gymnasium/swimmer",
 ]
-"""Solved or refused within minutes on two cores; `python -m mjx_drax.third_party` runs them all."""
+"""Solved or refused within minutes on two cores; `python -m mjx_drax.studies.third_party` runs all."""
 
 
 @pytest.mark.slow
@@ -87,7 +87,9 @@ def test_rows_of_the_table():
 
 
 def test_models_are_chosen_by_name(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("mjx_drax.third_party.models", lambda: {"own/rock": tmp_path / "rock.xml"})
+    monkeypatch.setattr(
+        "mjx_drax.studies.third_party.models", lambda: {"own/rock": tmp_path / "rock.xml"}
+    )
     assert main(["own/stone"]) == 2
     assert "there is no model own/stone: there is own/rock" in capsys.readouterr().err
     (tmp_path / "rock.xml").write_text("<mujoco model='rock'><worldbody/></mujoco>")

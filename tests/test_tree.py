@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax._mjx import mjx
-from mjx_drax._mujoco import mujoco
 from mjx_drax.models import path
-from mjx_drax.tree import com_pos, com_vel, kinematics, mass_matrix, rne
+from mjx_drax.physics._mjx import mjx
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
 
 EVERY_JOINT = """<mujoco><worldbody>
 <body name="moved" mocap="true" pos="1 0 0" quat="0.6 0.8 0 0"><geom size="0.1"/></body>

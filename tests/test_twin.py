@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, from_mjcf
-from mjx_drax.agreement import Engine, Probes, compare
-from mjx_drax.errors import DraxWarning
-from mjx_drax.physics import step
-from mjx_drax.twin import (
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.physics.agreement import Engine, Probes, compare
+from mjx_drax.physics.mjx_model import (
     NEAREST,
     constraint_rows,
     contact_pairs,
@@ -23,6 +22,7 @@ from mjx_drax.twin import (
     nearest_only,
     twin,
 )
+from mjx_drax.physics.step import step
 
 CHAIN = """
 <mujoco model="chain">

@@ -1,0 +1,1 @@
+"""What every room uses: errors, pytrees, files. No numerics."""

@@ -1,0 +1,101 @@
+"""Files that appear once they are complete: an interrupted program leaves no half of one.
+
+What they will need is tried before a long computation, not found missing after it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import importlib.util
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from mjx_drax.base.errors import DraxError, shown
+
+
+def file_path(path: object) -> Path:
+    """The path of a file or folder, `~` being the user's home.
+
+    Raises:
+        DraxError: it is no path.
+    """
+    try:
+        target = Path(path).expanduser()  # type: ignore[arg-type]
+        os.fsencode(target)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DraxError(f"the path is {shown(path)}: give a text or a pathlib.Path.") from error
+    if "\0" in str(target):
+        raise DraxError(f"the path is {shown(path)}: remove the null character.")
+    return target
+
+
+@contextlib.contextmanager
+def complete(path: str | os.PathLike[str], suffixes: tuple[str, ...] = ()) -> Iterator[Path]:
+    """A temporary path beside `path`, which takes its place when the block ends without an error.
+
+    Args:
+        path: of the file to write; its folder is made if need be, `~` is the user's home.
+        suffixes: what its name may end in; anything if empty.
+
+    Raises:
+        DraxError: it ends otherwise, or cannot be written.
+    """
+    target = file_path(path)
+    if suffixes and target.suffix.lower() not in suffixes:
+        raise DraxError(f"{target.name!r} does not end in {' or '.join(suffixes)}: rename it.")
+    if target.is_dir():
+        raise DraxError(f"cannot write {str(target)!r}: it is a folder; give a file in it.")
+    partial = target.with_name(_partial(target, str(os.getpid())))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        with open(partial, "rb") as file:
+            os.fsync(file.fileno())  # or a power cut could leave the name without the content
+        os.replace(partial, target)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DraxError(f"cannot write {str(target)!r}: {reason}. Choose another place.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def _partial(target: Path, process: str) -> str:
+    """The name under which a process writes a file."""
+    return f".{target.stem}.{process}.partial{target.suffix}"
+
+
+class _Tried(Exception):
+    """A file was tried and is not to be kept."""
+
+
+def require_room(path: str | os.PathLike[str], size: int = 1) -> None:
+    """Complain about a file that could not be written; call it before a long computation.
+
+    It is tried, with `size` bytes, and removed. So is what killed processes left of it.
+
+    Raises:
+        DraxError: the folder cannot be made or written to, or the disk is too full.
+    """
+    target = Path(path).expanduser()
+    for left in target.parent.glob(_partial(Path(glob.escape(target.name)), "*")):
+        with contextlib.suppress(OSError):
+            left.unlink()
+    with contextlib.suppress(_Tried), complete(target) as partial:
+        with open(partial, "wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+        raise _Tried
+
+
+def require(package: str, extra: str, purpose: str) -> None:
+    """Complain about an optional package that is not installed; call it before a long computation.
+
+    Raises:
+        DraxError: naming the command that installs it.
+    """
+    if importlib.util.find_spec(package) is None:
+        raise DraxError(
+            f'{purpose} needs {package}, which is not installed: pip install "mjx-drax[{extra}]".'
+        )

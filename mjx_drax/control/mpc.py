@@ -1,0 +1,605 @@
+"""Model predictive control: the same problem again and again, from where the system now is.
+
+A plan made at time t_0 holds x_0..x_K, u_0..u_{K-1} and the feedback gains K_k of its last
+factorization. Until the next plan arrives, the control at time t = t_0 + (k + w) dt, 0 <= w < 1, is
+
+    u = u_k + K_k (x - x_plan(t)),   clipped to the control bounds,
+
+where x_plan(t) lies between x_k and x_{k+1}. The next plan starts from this one, s = (t - t_0) / dt
+knots later: knots, slacks and all multipliers move s places forward (between two places they are
+interpolated), and behind the last knot f goes on with the last control. A few iterations of the
+noise-free tail then bring it back to the dynamics from the state that was measured. All of this,
+and the choice of the best chain, is one compiled function; x, s and the number of iterations are
+traced, and only the best chain's plan comes to the host.
+
+Keepers are chains that go on like that. Explorers start from the best plan again and again, are
+heated, and cooled over several plans as in a solve, while the horizon recedes under them; one that
+becomes feasible and clearly cheaper takes the place of the worst keeper, and is applied.
+
+A goal at the end of a horizon that recedes may never be reached: tomorrow is as good. So the
+terminal cost also runs along the horizon, with the weight `hold`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import Partial
+from jax.typing import ArrayLike
+
+from mjx_drax.base.errors import (
+    DraxError,
+    is_number,
+    require_not_negative,
+    require_whole,
+    shown,
+)
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.kernels.compilation import compiled
+from mjx_drax.kernels.linalg import exact
+from mjx_drax.kernels.scalarize import pruned
+from mjx_drax.method.langevin import FEASIBLE, Info, Langevin, Scale, State, evaluate, ranking
+from mjx_drax.method.metrics import GaussNewton
+from mjx_drax.physics.states import difference, integrate
+from mjx_drax.problem.problem import Cost, Problem, Stagewise, Trajectory, checked, numbers
+from mjx_drax.search.restarts import Restarts, as_restarts, run, unit_of
+
+AHEAD = 8
+"""Knots that f goes on for behind the last one; a shift by more repeats the state reached."""
+
+CHEAPER = 0.9
+"""Another chain is applied if its cost is below that of the one applied by this factor."""
+
+HEATED, CYCLE = 30, 50
+"""Iterations of an explorer with noise, and of all, before it starts again."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Plan:
+    """The best chain's plan.
+
+    Attributes:
+        x: states x_0..x_K, (K + 1, nx).
+        u: controls, (K, nu).
+        gains: feedback K_k, (K, nu, ndx).
+        cost, max_defect: of the plan, scalars.
+        finite: whether it may be used.
+        switched: whether another chain than the last plan's was the best.
+        time: of x_0 [s]; set on the host.
+    """
+
+    x: Any
+    u: Any
+    gains: Any
+    cost: Any
+    max_defect: Any
+    finite: Any
+    switched: Any
+    time: float = 0.0
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Carried:
+    """What stays on the device between plans.
+
+    Attributes:
+        state: of all chains; the explorers are the last ones.
+        best: which chain is applied, always a keeper.
+        lost: whether its plan broke the dynamics.
+        spare: the worst keeper, which may be given other knots.
+        age: iterations since an explorer last started, (chains,); 0 for keepers.
+        key: for the explorers' noise.
+    """
+
+    state: State
+    best: Array
+    lost: Array
+    spare: Array
+    age: Array
+    key: Array
+
+
+@dataclass
+class Statistics:
+    """What a policy did since it was reset.
+
+    Attributes:
+        latencies: time that each plan took [s].
+        costs, max_defects: of the plans.
+        failed: plans that were not finite; the last good one stayed in use.
+        switches: plans that changed to another chain.
+        unmeasured: states given that were not finite; the planned control was applied.
+    """
+
+    latencies: list[float] = field(default_factory=list)
+    costs: list[float] = field(default_factory=list)
+    max_defects: list[float] = field(default_factory=list)
+    failed: int = 0
+    switches: int = 0
+    unmeasured: int = 0
+
+    @property
+    def plans(self) -> int:
+        """How many plans were made."""
+        return len(self.latencies)
+
+
+class MPC:
+    """A policy u = policy(x, t) that plans as it goes.
+
+    >>> policy = mjx_drax.MPC(problem)
+    >>> policy.reset(x, t)        # a whole solve; the first call would do it
+    >>> u = policy(x, t)          # (nu,), for as long as the robot runs
+
+    Calling it plans whenever `every` control steps have passed, and applies feedback in between.
+    `plan` and `control` are the two halves; `Background` runs the first in a thread.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        chains: int = 8,
+        explorers: int | None = None,
+        iterations: int = 2,
+        every: int = 1,
+        hold: float = 0.1,
+        seed: int = 0,
+        solver: Langevin | Restarts | None = None,
+    ) -> None:
+        """Nothing is compiled yet.
+
+        Args:
+            problem: from `from_mjcf` or `from_function`; its x_init is replaced by what is given.
+            chains: number of chains, explorers included.
+            explorers: how many of them explore; by default half.
+            iterations: of every chain for a plan.
+            every: control steps between two plans.
+            hold: weight [1/s] of the terminal cost along the horizon: hold dt phi(x_k) is added to
+                the running cost. 0 leaves the problem as it is.
+            seed: of all random numbers.
+            solver: of the first solve, whose tail makes the plans; `Restarts()` by default.
+
+        Raises:
+            DraxError: a setting that cannot work, named with its value and the fix.
+        """
+        problem = checked(problem)
+        require_whole("chains", chains)
+        explorers = chains // 2 if explorers is None else explorers
+        for name, count, least in (
+            ("iterations", iterations, 1),
+            ("every", every, 1),
+            ("explorers", explorers, 0),
+        ):
+            require_whole(name, count, least)
+        if explorers >= chains:
+            raise DraxError(
+                f"explorers is {explorers} of {chains} chains: leave at least one that does not."
+            )
+        require_not_negative("hold", hold)
+        if any(end.ndim > 1 for end in jax.tree.leaves(problem.bounds)):
+            raise DraxError(
+                f"bounds of {problem.name} differ from knot to knot, but the horizon recedes: "
+                "give the same ones for all, of shapes (nx,) and (nu,)."
+            )
+        self.solver = Restarts() if solver is None else solver
+        self.original, self.problem = problem, holding(problem, hold)
+        as_restarts(self.problem, chains, seed, self.solver)
+        if not isinstance(self.solver.flow.preconditioner, GaussNewton):
+            raise DraxError(
+                f"preconditioner is {type(self.solver.flow.preconditioner).__name__}, which brings "
+                "no feedback gains: give GaussNewton()."
+            )
+        if iterations > self.solver.flow.tail:
+            raise DraxError(
+                f"iterations is {iterations}, but the solver's tail has {self.solver.flow.tail}: "
+                "give fewer, or a longer tail."
+            )
+        self.chains, self.explorers = chains, int(explorers)
+        self.iterations, self.every, self.seed = iterations, every, seed
+        self.statistics = Statistics()
+        self.first_solve = 0.0
+        self._plan: Plan | None = None
+        self._time = 0.0
+        self._start: tuple[Carried, Plan] | None = None
+        self._lower, self._upper = (
+            np.asarray(end, float) for end in (problem.bounds.u_lower, problem.bounds.u_upper)
+        )
+
+    @property
+    def latest(self) -> Plan:
+        """The plan in use.
+
+        Raises:
+            DraxError: there is none yet.
+        """
+        if self._plan is None:
+            raise DraxError("there is no plan yet: call policy.reset(x), or policy(x, t).")
+        return self._plan
+
+    def reset(self, x: ArrayLike, t: float = 0.0) -> Plan:
+        """Solve from x (nx,) as `solve` does, and make that the plan at time t [s].
+
+        Everything that later plans need is compiled here too.
+
+        Raises:
+            DraxError: x does not fit the problem, or is not finite; nor is t.
+        """
+        problem = self.problem.with_x_init(x)
+        _require_time(t)
+        clock = time.perf_counter()
+        found = run(problem, self.chains, self.seed, self.solver, devices=1)
+        unit = unit_of(np.asarray(found.records[0][1].cost))
+        if isinstance(self.solver, Restarts):
+            self._flow = self.solver.first(unit)
+        else:
+            self._flow = self.solver
+        self._heated = replace(
+            self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
+        )
+        self._traced = jax.device_put(problem)
+        carried = _first(found.state, found.info, self.explorers, self.seed)
+        self._plan = None
+        self._apply(carried, x, t, 0.0)  # compiles
+        self.first_solve = time.perf_counter() - clock
+        self._start = self._carried, self.latest
+        self.statistics = Statistics()
+        return self.latest
+
+    def rewind(self, t: float = 0.0) -> Plan:
+        """Go back to the plan that the last `reset` made, at time t [s], without solving again."""
+        if self._start is None:
+            raise DraxError("there is nothing to go back to: call policy.reset(x) first.")
+        _require_time(t)
+        self._carried, plan = self._start
+        self._plan, self._time = replace(plan, time=t), t
+        self.statistics = Statistics()
+        return self._plan
+
+    def plan(self, x: ArrayLike, t: float) -> Plan:
+        """A plan from the state x (nx,) at time t [s], starting from the one in use.
+
+        What is not finite is not used: the plan stays, and `statistics.failed` counts it.
+
+        Raises:
+            DraxError: there is no plan yet, x is no vector (nx,), or t is not finite.
+        """
+        self.latest  # noqa: B018 complains if there is none
+        x = self._state(x)
+        _require_time(t)
+        by = max(0.0, (t - self._time) / float(self.problem.dynamics.dt))
+        clock = time.perf_counter()
+        plan = self._apply(self._carried, x, t, by)
+        statistics = self.statistics
+        statistics.latencies.append(time.perf_counter() - clock)
+        statistics.failed += not plan.finite
+        if plan.finite:
+            statistics.switches += bool(plan.switched)
+            statistics.costs.append(float(plan.cost))
+            statistics.max_defects.append(float(plan.max_defect))
+        return self.latest
+
+    def control(self, x: ArrayLike, t: float) -> np.ndarray:
+        """The control (nu,) at time t [s] for the state x (nx,), by the plan's feedback.
+
+        Raises:
+            DraxError: there is no plan yet, x is no vector (nx,), or t is not finite.
+        """
+        x = self._state(x)
+        _require_time(t)
+        plan, K = self.latest, self.problem.horizon
+        s = np.clip((t - plan.time) / float(self.problem.dynamics.dt), 0.0, K)
+        k = int(min(s + 1e-6, K - 1))
+        if not np.isfinite(x).all():
+            self.statistics.unmeasured += 1
+            return np.clip(np.asarray(plan.u[k], float), self._lower, self._upper)
+        planned = self._between(plan.x[k], plan.x[k + 1], s - k)
+        off = np.asarray(self._difference(x, planned), float)
+        return np.clip(plan.u[k] + plan.gains[k] @ off, self._lower, self._upper)
+
+    def __call__(self, x: ArrayLike, t: float) -> np.ndarray:
+        """The control (nu,) at time t [s] for the state x (nx,), after a new plan if one is due."""
+        if self._plan is None:
+            self.reset(x, t)
+        elif self.due(t) and np.isfinite(self._state(x)).all():
+            self.plan(x, t)
+        return self.control(x, t)
+
+    def due(self, t: float) -> bool:
+        """Whether `every` control steps have passed since the plan in use was made."""
+        _require_time(t)
+        steps = (t - self.latest.time) / float(self.problem.dynamics.dt)
+        return steps > self.every - 1e-6
+
+    def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
+        """Plan in one launch, and use it if it is finite."""
+        level = 1.0 if self._plan is None else float(abs(self._plan.cost))
+        scale = Scale(self._heated.scale.cost, np.float32(np.sqrt(max(level, 1e-12))))
+        self._time = t  # of what is carried; the plan in use is older after one that failed
+        self._carried, device = _plan(
+            self._flow,
+            replace(self._heated, scale=scale),
+            self._traced,
+            carried,
+            np.asarray(x, self._traced.x_init.dtype),
+            np.float32(by),
+            np.int32(self.iterations),
+            self.explorers,
+        )
+        plan: Plan = replace(jax.device_get(device), time=t)
+        if plan.finite or self._plan is None:
+            self._plan = plan
+        return plan
+
+    def _state(self, x: ArrayLike) -> np.ndarray:
+        """A state as it was measured, (nx,) numbers that need not be finite."""
+        nx = self.problem.dynamics.nx
+        try:
+            state = numbers(x)
+        except (TypeError, ValueError) as error:
+            raise DraxError(f"the state x is {shown(x)}: give {nx} numbers.") from error
+        if state.shape != (nx,):
+            raise DraxError(f"the state x has shape {state.shape}: give {nx} numbers, ({nx},).")
+        return state
+
+    def _difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """x - y in the tangent space at y, (ndx,), on the host."""
+        dynamics: Any = self.problem.dynamics
+        if dynamics.nx == dynamics.ndx:
+            return x - y
+        return difference(dynamics.mj_model, x, np.asarray(y, float))
+
+    def _between(self, x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
+        """The state (nx,) a share of the way from x to y, on the host."""
+        if self.problem.dynamics.nx == self.problem.dynamics.ndx:
+            return np.asarray(x + share * (y - x))
+        dynamics: Any = self.problem.dynamics
+        x = np.asarray(x, float)
+        return integrate(dynamics.mj_model, x, share * self._difference(np.asarray(y, float), x))
+
+
+def _require_time(t: float) -> None:
+    if not is_number(t):
+        raise DraxError(f"the time t is {shown(t)}: give a finite number of seconds.")
+
+
+def holding(problem: Problem, hold: float) -> Problem:
+    """The problem with hold dt phi(x) added to its running cost; hold [1/s] is traced."""
+    if hold == 0.0:
+        return problem
+    weight = np.float32(hold * problem.dynamics.dt)
+    running, terminal = problem.running, problem.terminal
+    scalar, residual = running.scalar, running.residual
+    if terminal.scalar is not None:
+        scalar = Partial(_held, scalar, terminal.scalar, weight)
+    if terminal.residual is not None:
+        residual = Partial(_held_residual, residual, terminal.residual, np.sqrt(weight))
+    return replace(problem, running=Cost(scalar, residual))
+
+
+def _held(running: Partial | None, terminal: Partial, weight: Array, seen: Any, u: Array) -> Array:
+    """l + weight phi, scalar."""
+    held = weight * terminal(seen)
+    return held if running is None else running(seen, u) + held
+
+
+def _held_residual(
+    running: Partial | None, terminal: Partial, root: Array, seen: Any, u: Array
+) -> Array:
+    """[r, root r_end], (n,)."""
+    held = root * jnp.ravel(terminal(seen))
+    return held if running is None else jnp.concatenate([jnp.ravel(running(seen, u)), held])
+
+
+def _first(state: State, info: Info, explorers: int, seed: int) -> Carried:
+    """The chains of a solve, the best ones as keepers; the explorers at all ages."""
+    chains = len(info.cost)
+    count = chains - explorers
+    age = np.zeros(chains, np.int32)
+    age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
+    order = np.lexsort(ranking(info.cost, info.max_defect)[::-1])
+    return Carried(
+        _rows(state, order),
+        jnp.int32(0),
+        jnp.array(False),
+        jnp.int32(count - 1),
+        jnp.asarray(age),
+        jax.random.key(seed),
+    )
+
+
+def _rows(state: State, which: ArrayLike) -> State:
+    """Some of the chains."""
+    which = jnp.asarray(which)
+    return jax.tree.map(lambda a: a[which], state)
+
+
+@partial(compiled, static_argnames="explorers")
+@exact
+def _plan(
+    flow: Langevin,
+    heated: Langevin,
+    problem: Problem,
+    carried: Carried,
+    x: Array,
+    by: Array,
+    iterations: Array,
+    explorers: int,
+) -> tuple[Carried, Plan]:
+    """Shift by `by` knots, iterate from x, and choose: one plan, all on the device."""
+    problem = replace(problem, x_init=x)
+    chains, best, age, key = len(carried.age), carried.best, carried.age, carried.key
+    exploring = jnp.arange(chains) >= chains - explorers
+    state = jax.vmap(partial(_shifted, flow, problem, by))(carried.state)
+    if explorers:
+        key, fresh = jax.random.split(key)
+        state = _restarted(heated, problem, state, best, exploring & (age == 0), fresh)
+    state = _led_back(flow, problem, state, carried)
+    total = jnp.int32(flow.iterations + flow.tail)
+    start = jnp.where(exploring, age, total - iterations)
+    state = _iterated(flow, heated, problem, state, exploring, start, iterations)
+    age = jnp.where(exploring & (age + iterations < CYCLE), age + iterations, 0)
+    info = evaluate(problem, state.trajectory)
+    alive = state.alive & jnp.isfinite(info.cost) & jnp.isfinite(info.max_defect)
+    cost = jnp.where(alive & (info.max_defect < FEASIBLE), info.cost, jnp.inf)
+    chosen = _chosen(info, cost, alive, best)
+    plan = Plan(
+        x=problem.with_start(state.trajectory)[chosen],
+        u=state.trajectory.u[chosen],
+        gains=state.gains[chosen],
+        cost=info.cost[chosen],
+        max_defect=info.max_defect[chosen],
+        finite=alive[chosen],
+        switched=chosen != best,
+    )
+    # An explorer that is applied becomes a keeper, and so does whatever replaces the dead
+    worst = jnp.argmax(jnp.where(exploring, -jnp.inf, cost))
+    places, found = jnp.arange(chains), exploring[chosen]
+    source = jnp.where(alive | exploring, places, chosen)
+    source = jnp.where(found & (places == worst), chosen, source)
+    best = jnp.where(found, worst, chosen)
+    mine = (places == best) | exploring
+    spare = jnp.argmax(jnp.where(mine, -jnp.inf, jnp.where(alive, cost, jnp.inf)))
+    lost = ~(info.max_defect[chosen] < FEASIBLE)
+    return Carried(_rows(state, source), best, lost, spare, age, key), plan
+
+
+def _chosen(info: Info, cost: Array, alive: Array, best: Array) -> Array:
+    """The chain to apply: of the feasible ones the cheapest, else the one with least max|h|.
+
+    The one that was applied last has an advantage, so that plans do not alternate.
+    """
+    mine = jnp.arange(len(cost)) == best
+    cost = jnp.where(mine, cost - (1.0 - CHEAPER) * jnp.abs(info.cost), cost)
+    defect = jnp.where(mine, CHEAPER, 1.0) * jnp.where(alive, info.max_defect, jnp.inf)
+    return jnp.argmin(jnp.where(jnp.isfinite(cost).any(), cost, defect))
+
+
+def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) -> State:
+    """The spare keeper's knots replaced by a rollout of the applied plan, if that was lost.
+
+    After a push the knots are far from any motion, and few iterations do not bring them back. The
+    controls with their feedback, followed from x, give a motion to start from.
+    """
+    dynamics, best, box = problem.dynamics, carried.best, problem.bounds
+    knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
+
+    def follow(x: Array, stage: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        planned, u, gain = stage
+        wanted = u + gain @ dynamics.difference(x, planned)
+        u = jnp.clip(wanted, box.u_lower, box.u_upper)
+        x = dynamics.step(x, u)
+        return x, (x, u)
+
+    _, (x, u) = jax.lax.scan(follow, problem.x_init, (problem.stages(knots), knots.u, gains))
+    rolled = Trajectory(jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0))
+    everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
+    moved = flow.moved_to(problem, state, everyone)
+    moved = replace(moved, damping=jnp.ones_like(state.damping))
+    which = carried.lost & (carried.spare != best) & (jnp.arange(len(state.alive)) == carried.spare)
+    return _where(which, moved, state)
+
+
+def _restarted(
+    heated: Langevin, problem: Problem, state: State, best: Array, which: Array, key: Array
+) -> State:
+    """The chains (chains,) that are to start again do so from the best one's knots."""
+    knots = jax.tree.map(lambda a: jnp.broadcast_to(a[best], a.shape), state.trajectory)
+    started = heated.init(problem, replace(knots, slack=None), key)
+    return _where(which, started, state)
+
+
+def _where(which: Array, new: State, old: State) -> State:
+    """The new state for some chains (chains,), the old one for the others."""
+
+    def chosen(a: Array, b: Array) -> Array:
+        return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(chosen, new, old)
+
+
+def _iterated(
+    flow: Langevin,
+    heated: Langevin,
+    problem: Problem,
+    state: State,
+    exploring: Array,
+    start: Array,
+    iterations: Array,
+) -> State:
+    """So many iterations of every chain, from its own `start` (chains,) in its own schedules."""
+
+    def one(exploring: Array, start: Array, state: State, i: Array) -> State:
+        solver = jax.tree.map(partial(jnp.where, exploring), heated, flow)
+        alone = jax.tree.map(lambda a: a[None], state)
+        return jax.tree.map(lambda a: a[0], solver.step(problem, alone, start + i))
+
+    @pruned  # jit does it to all but the bodies of loops
+    def step(i: Array, state: State) -> State:
+        return jax.vmap(partial(one, i=i))(exploring, start, state)
+
+    return jax.lax.fori_loop(0, iterations, step, state)
+
+
+def _shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
+    """One chain `by` knots later; one that had died starts anew with its multipliers."""
+    dynamics, K = problem.dynamics, problem.horizon
+    knots, multipliers = state.trajectory, state.multipliers
+    place = by + jnp.arange(K)
+    low = jnp.floor(place).astype(jnp.int32)
+    share = place - low
+
+    def rows(a: Array) -> Array:
+        """Rows of (K, ...) at those places, the last one repeated."""
+        one, two = a[jnp.minimum(low, K - 1)], a[jnp.minimum(low + 1, K - 1)]
+        return one + share.reshape(-1, *[1] * (a.ndim - 1)) * (two - one)
+
+    def ahead(x: Array, _: None) -> tuple[Array, Array]:
+        x = dynamics.step(x, knots.u[-1])
+        return x, x
+
+    _, beyond = jax.lax.scan(ahead, knots.x[-1], length=AHEAD)
+    beyond = jnp.where(jnp.isfinite(beyond), beyond, knots.x[-1])
+    inside = flow.bounds.interior(
+        problem.bounds, Trajectory(beyond, jnp.broadcast_to(knots.u[-1], (AHEAD, dynamics.nu)))
+    )
+    x = jnp.concatenate([knots.x, inside.x])
+    one, two = (x[jnp.minimum(low + i, K + AHEAD - 1)] for i in (0, 1))
+    x = jax.vmap(lambda a, b, w: dynamics.integrate(a, w * dynamics.difference(b, a)))(
+        one, two, share
+    )
+
+    def stages(numbers: Stagewise) -> Stagewise:
+        return replace(numbers, stage=rows(numbers.stage))
+
+    def shifted(z: Trajectory) -> Trajectory:
+        slack = None if z.slack is None else stages(z.slack)
+        return Trajectory(rows(z.x), rows(z.u), slack)
+
+    of_bounds = multipliers.bounds
+    if of_bounds is not None:
+        of_bounds = shifted(of_bounds[0]), shifted(of_bounds[1])
+    later = replace(
+        multipliers,
+        dynamics=rows(multipliers.dynamics),
+        constraints=stages(multipliers.constraints),
+        bounds=of_bounds,
+    )
+    return replace(
+        state,
+        trajectory=replace(shifted(knots), x=x),
+        multipliers=jax.tree.map(lambda m: jnp.where(state.alive, m, 0.0), later),
+        damping=jnp.where(state.alive, state.damping, 1.0),
+        gains=rows(state.gains),
+        alive=jnp.ones_like(state.alive),
+        died_at=jnp.full_like(state.died_at, -1),
+    )

@@ -1,0 +1,238 @@
+"""A policy in the loop with a plant, run after run, and what came of it in numbers."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax.base.errors import DraxError, require_positive, require_whole
+from mjx_drax.base.files import complete
+from mjx_drax.control.background import Background
+from mjx_drax.control.mpc import MPC, Statistics
+from mjx_drax.control.plant import Plant, Push, random_pushes
+from mjx_drax.problem.problem import Problem
+
+SETTLE = 4.0
+"""Time without pushes at the end of a run [s], at least."""
+
+PERCENTILES = 50, 90, 99
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One run in the loop.
+
+    Attributes:
+        times: of the states, (T + 1,) [s].
+        states: of the plant at every physics step, (T + 1, nx).
+        controls: that were applied, (T, nu).
+        statistics: of the policy.
+        reached: whether the run ended in the goal; None without a goal.
+        pushes: what it had to bear.
+    """
+
+    times: np.ndarray
+    states: np.ndarray
+    controls: np.ndarray
+    statistics: Statistics
+    reached: bool | None
+    pushes: Sequence[Push]
+
+
+def simulate(
+    policy: MPC,
+    plant: Plant,
+    duration: float,
+    *,
+    realtime: bool = False,
+    pushes: Sequence[Push] = (),
+) -> Motion:
+    """Drive the plant for so many seconds.
+
+    Args:
+        policy: that has been reset, or rewound, to the plant's time.
+        plant: where it starts.
+        duration: [s].
+        realtime: the plant runs by the clock on the wall while a thread plans; else it waits for
+            each plan.
+        pushes: the plant's, to be reported.
+
+    Raises:
+        DraxError: the duration is not a positive number.
+    """
+    require_positive("duration", duration, "a positive number of seconds")
+    if realtime:
+        with Background(policy) as background:
+            return _driven(policy, background, plant, duration, True, pushes)
+    return _driven(policy, policy, plant, duration, False, pushes)
+
+
+def _driven(
+    policy: MPC,
+    act: Callable[[np.ndarray, float], np.ndarray],
+    plant: Plant,
+    duration: float,
+    realtime: bool,
+    pushes: Sequence[Push],
+) -> Motion:
+    times, states, controls = [plant.time], [plant.state], []
+    began = time.perf_counter() - plant.time
+    while plant.time < duration - 1e-9:
+        u = act(plant.measured(), plant.time)
+        plant.step(u)
+        controls.append(u)
+        times.append(plant.time)
+        states.append(plant.state)
+        if realtime:
+            time.sleep(max(0.0, began + plant.time - time.perf_counter()))
+    end = states[-1]
+    reached = policy.problem.reached(end) if np.isfinite(end).all() else False
+    found = np.array(times), np.array(states), np.array(controls)
+    return Motion(*found, policy.statistics, reached, pushes)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Several runs of one policy, each with pushes of its own."""
+
+    policy: MPC
+    duration: float
+    realtime: bool
+    motions: list[Motion] = field(default_factory=list)
+
+    def check(self, count: int, pushes: int) -> tuple[float, float]:
+        """Between which times pushes come [s]; call it before the policy is reset.
+
+        Raises:
+            DraxError: numbers that make no sense, or runs that leave no time for pushes.
+        """
+        require_whole("runs", count)
+        require_whole("pushes", pushes, 0)
+        require_positive("duration", self.duration, "a positive number of seconds")
+        begin, end = float(self.policy.problem.times[-1]), self.duration - SETTLE
+        if pushes and begin >= end:
+            raise DraxError(
+                f"a run of {self.duration:g} s leaves no time for pushes: they come after the "
+                f"horizon of {begin:g} s and {SETTLE:g} s before the end. Make it longer."
+            )
+        return begin, end
+
+    def run(
+        self,
+        count: int,
+        pushes: int,
+        push: float,
+        seed: int = 0,
+        report: Callable[[int, Motion], None] | None = None,
+        **plant: Any,
+    ) -> Trials:
+        """`count` runs from the problem's x_init, with so many pushes of a size [m/s] in each.
+
+        Pushes fall between the end of the first horizon and `SETTLE` before the end. `plant` holds
+        arguments of `Plant`; run i has the seed `seed` + i.
+
+        Raises:
+            DraxError: the runs leave no time for pushes.
+        """
+        problem = self.policy.problem
+        begin, end = self.check(count, pushes)
+        for i in range(count):
+            hits = random_pushes(problem, pushes, push, (begin, end), seed + i) if pushes else []
+            self.policy.rewind()
+            body = Plant(problem, pushes=hits, seed=seed + i, **plant)
+            motion = simulate(self.policy, body, self.duration, realtime=self.realtime, pushes=hits)
+            self.motions.append(motion)
+            if report is not None:
+                report(i, motion)
+        return self
+
+    def summary(self) -> dict[str, Any]:
+        """What `mpc.json` holds. Costs are those of the problem, summed over the steps driven."""
+        policy, runs = self.policy, [m.statistics for m in self.motions]
+        latencies = np.concatenate([s.latencies for s in runs])
+        judged = [m.reached for m in self.motions if m.reached is not None]
+        driven = [_cost(policy, m) for m in self.motions]
+        return {
+            "task": policy.problem.name,
+            "device": jax.devices()[0].device_kind,
+            "horizon": policy.problem.horizon,
+            "dt": float(policy.problem.dynamics.dt),
+            "chains": policy.chains,
+            "explorers": policy.explorers,
+            "iterations": policy.iterations,
+            "every": policy.every,
+            "seed": policy.seed,
+            "realtime": self.realtime,
+            "duration": self.duration,
+            "first_solve_s": policy.first_solve,
+            "plans": len(latencies),
+            "plans_per_s": float(1.0 / latencies.mean()),
+            "latency_s": {f"p{p}": float(np.percentile(latencies, p)) for p in PERCENTILES},
+            "failed_plans": sum(s.failed for s in runs),
+            "switches": sum(s.switches for s in runs),
+            "runs": len(self.motions),
+            "reached": sum(judged) if judged else None,
+            "success_rate": float(np.mean(judged)) if judged else None,
+            "cost": float(np.mean(driven)),
+            "costs": driven,
+            "pushes": [[vars(push) for push in m.pushes] for m in self.motions],
+        }
+
+
+def _cost(policy: MPC, motion: Motion) -> float:
+    """phi at the end plus the running cost at the start of every control step that was driven."""
+    problem = policy.original
+    each = round(float(problem.dynamics.dt) / (motion.times[1] - motion.times[0]))
+    x, u = jnp.asarray(motion.states[:-1:each]), jnp.asarray(motion.controls[::each])
+    total = jax.jit(_total)(problem, x, u, jnp.asarray(motion.states[-1]))
+    return float(total)
+
+
+def _total(problem: Problem, x: jax.Array, u: jax.Array, end: jax.Array) -> jax.Array:
+    return jnp.sum(jax.vmap(problem.running_cost)(x, u)) + problem.terminal_cost(end)
+
+
+def lines(numbers: dict[str, Any]) -> list[str]:
+    """The summary for a person."""
+    latency = ", ".join(f"{p} {1e3 * s:.1f}" for p, s in numbers["latency_s"].items())
+    waits = "in real time" if numbers["realtime"] else "the plant waits for each plan"
+    share = numbers["success_rate"]
+    count = sum(map(len, numbers["pushes"]))
+    outcome = (
+        "no goal to judge by"
+        if share is None
+        else (f"{numbers['reached']} of {numbers['runs']} end in the goal ({share:.0%})")
+    )
+    return [
+        f"rate      {numbers['plans_per_s']:.1f} plans/s on {numbers['device']}; {waits}",
+        f"latency   {latency} ms over {numbers['plans']} plans, {numbers['failed_plans']} failed",
+        f"cost      {numbers['cost']:.4g} a run of {numbers['duration']:g} s, on average",
+        f"runs      {outcome}; {count} pushes in all",
+    ]
+
+
+def save(numbers: dict[str, Any], folder: Path) -> Path:
+    """Write `mpc.json`; returns its path."""
+    with complete(folder / "mpc.json") as partial:
+        partial.write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
+    return folder / "mpc.json"
+
+
+def film(problem: Problem, motion: Motion, path: str | os.PathLike[str], **look: Any) -> Path:
+    """A film of one run; see `rendering.render_motion`."""
+    from mjx_drax.view.rendering import render_motion
+
+    dynamics: Any = problem.dynamics
+    lines_ = [f"{problem.name}, model predictive control", "t = {time}"]
+    lines_ += [f"push of {p.force[0]:+.1f} N on {p.body} at {p.time:.2f} s" for p in motion.pushes]
+    qpos = motion.states[:, : dynamics.mj_model.nq]
+    return render_motion(dynamics.mj_model, qpos, motion.times, path, overlay=lines_, **look)

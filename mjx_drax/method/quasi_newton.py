@@ -1,0 +1,125 @@
+"""A quasi-Newton baseline: L-BFGS on the augmented Lagrangian.
+
+The metric M^{-1} is the limited-memory BFGS approximation of the inverse Hessian of L_mu, built
+from the last steps s and gradient changes y (two-loop recursion; Nocedal and Wright, Numerical
+Optimization, algorithm 7.4). It is meant for noise-free use with the line search of the tail,
+
+    Langevin(iterations=0, tail=1000, preconditioner=LBFGS())
+
+which is the classical method of multipliers: `inner` steps at fixed lambda, then
+lambda <- lambda + mu h. With noise, the noise is white (M = I).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.method.metrics import Bounds, Direction, Identity, Levels, Multipliers, at_rest
+from mjx_drax.problem.problem import Problem, Trajectory
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Memory:
+    """Pairs s, y (pairs, n), the newest last; 1 / s'y (pairs,), 0 where there is none yet.
+
+    `point` and `gradient` (n,) are those of the last step, `count` the steps since lambda changed.
+    n counts tangent numbers; `point` is a trajectory.
+    """
+
+    s: Array
+    y: Array
+    curvature: Array
+    point: Trajectory
+    gradient: Array
+    count: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class LBFGS:
+    """Drift -M^{-1} grad L_mu with a limited-memory BFGS M.
+
+    Attributes:
+        pairs: how many (s, y) are kept.
+        inner: steps between two updates of the multipliers.
+    """
+
+    multipliers_step_alone = True
+    ladder = Identity.ladder  # the line search's step size is for the knots only
+
+    pairs: int = field(default=10, metadata=Static)
+    inner: int = field(default=20, metadata=Static)
+
+    def memory(self, problem: Problem, trajectory: Trajectory) -> Memory:
+        """No pairs yet."""
+        zero = ravel_pytree(at_rest(problem, trajectory))[0]
+        pairs, none = jnp.zeros((self.pairs, zero.shape[0])), jnp.zeros(self.pairs)
+        return Memory(pairs, pairs, none, trajectory, zero, jnp.zeros((), jnp.int32))
+
+    def direction(
+        self,
+        problem: Problem,
+        bounds: Bounds,
+        trajectory: Trajectory,
+        multipliers: Multipliers,
+        levels: Levels,
+        key: Array,
+        memory: Memory,
+    ) -> Direction:
+        """The quasi-Newton step; multipliers move in every `inner`-th step only."""
+        steepest = Identity().direction(problem, bounds, trajectory, multipliers, levels, key)
+        downhill, back = ravel_pytree(steepest.drift)
+        gradient = -downhill
+        memory = self._remember(problem, memory, trajectory, gradient)
+        drift = back(-_inverse_times(memory, gradient))
+        update = memory.count == self.inner
+        rate = jax.tree.map(lambda r: jnp.where(update, 0.5 * r, 0.0), steepest.multipliers)
+        count = jnp.where(update, 0, memory.count)
+        memory = Memory(memory.s, memory.y, memory.curvature, trajectory, gradient, count)
+        return Direction(drift, steepest.noise, rate, steepest.gains, memory)
+
+    def _remember(
+        self, problem: Problem, memory: Memory, trajectory: Trajectory, gradient: Array
+    ) -> Memory:
+        """The memory with the last step's pair, if lambda stood still and s'y is positive."""
+        change = jax.tree.map(jnp.subtract, trajectory, memory.point)
+        x = jax.vmap(problem.dynamics.difference)(trajectory.x, memory.point.x)
+        s, y = ravel_pytree(replace(change, x=x))[0], gradient - memory.gradient
+        product = jnp.dot(s, y)
+        good = (memory.count > 0) & (product > 1e-6 * jnp.dot(s, s))
+
+        def push(rows: Array, new: Array) -> Array:
+            return jnp.where(good, jnp.concatenate([rows[1:], new[None]]), rows)
+
+        return Memory(
+            push(memory.s, s),
+            push(memory.y, y),
+            push(memory.curvature, 1.0 / jnp.where(good, product, 1.0)),
+            memory.point,
+            memory.gradient,
+            memory.count + 1,
+        )
+
+
+def _inverse_times(memory: Memory, gradient: Array) -> Array:
+    """M^{-1} times the gradient (n,); without pairs a steepest-descent step of unit length."""
+    pairs = memory.curvature.shape[0]
+    q, weights = gradient, [jnp.zeros(())] * pairs
+    for i in reversed(range(pairs)):
+        weights[i] = memory.curvature[i] * jnp.dot(memory.s[i], q)
+        q = q - weights[i] * memory.y[i]
+    newest = memory.curvature[-1] * jnp.dot(memory.y[-1], memory.y[-1])
+    length = jnp.linalg.norm(gradient)
+    scale = jnp.where(newest > 0.0, newest, jnp.maximum(length, 1e-12))
+    q = q / scale
+    for i in range(pairs):
+        beta = memory.curvature[i] * jnp.dot(memory.y[i], q)
+        q = q + memory.s[i] * (weights[i] - beta)
+    return q

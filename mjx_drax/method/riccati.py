@@ -1,0 +1,225 @@
+"""Newton steps, noise and feedback from one block-tridiagonal factorization.
+
+Around a trajectory with defects h_k, the flow needs the minimizer d = (dx, du) of
+
+    sum_k [ gx'dx + gu'du + 1/2 (dx'Hxx dx + 2 du'Hux dx + du'Huu du) ]_k + terminal terms
+        + sum_k [ lambda_k'e_k + mu/2 |e_k|^2 ],      e_k = h_k + A_k dx_k + B_k du_k - dx_{k+1}
+
+that is d = -M^{-1} grad L_mu with M = H + mu J'J, and samples of N(0, M^{-1}). With the value
+function 1/2 x'Px + p'x of the stages after k, minimizing over dx_{k+1} at a fixed
+y = h + A dx + B du gives e = S^{-1} (P y + p - lambda), S = mu I + P, and
+
+    P~ = mu S^{-1} P                          (so P~ -> P as mu -> infinity: ordinary LQR)
+    p~ = S^{-1} (mu p + P lambda)
+    Qxx = Hxx + A'P~A      Quu = Huu + B'P~B      Qux = Hux + B'P~A
+    qx = gx + A'(P~h + p~)                    qu = gu + B'(P~h + p~)
+    K = -Quu^{-1} Qux      kff = -Quu^{-1} qu     P <- Qxx + Qux'K      p <- qx + Qux'kff
+
+which is the Riccati recursion with dual regularization. Nothing with a condition number near mu is
+ever formed, so float32 suffices. The conditional distributions of N(0, M^{-1}) are
+du | dx ~ N(K dx, Quu^{-1}) and e | y ~ N(S^{-1}P y, S^{-1}), for which the Cholesky factors of Quu
+and S are at hand. Newton step and noise are hence two solutions of one affine recursion
+
+    dx_{k+1} = F_k dx_k + f_k,     F = mu S^{-1} (A + B K)
+
+that is solved in parallel over time. Shapes: all arrays carry the stage axis K first.
+
+On a GPU a batch of chains with small blocks goes through one kernel instead (`riccati_kernel`): the
+recursion as a loop of array operations is bound by its launches there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.custom_batching import custom_vmap
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.kernels.linalg import cholesky, solve, solve_upper, symmetric
+from mjx_drax.method.linearize import Linearization
+
+MAX_NDX, MAX_NU = 6, 4
+"""Largest blocks that the kernel unrolls; compiling it takes longer than it saves beyond."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class QuadraticCost:
+    """Second-order model of the cost at x_0..x_K and u_0..u_{K-1}; all Hessians semidefinite.
+
+    gx (K+1, ndx), gu (K, nu), Hxx (K+1, ndx, ndx), Hux (K, nu, ndx), Huu (K, nu, nu).
+    """
+
+    gx: Array
+    gu: Array
+    Hxx: Array
+    Hux: Array
+    Huu: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Factorization:
+    """What the backward recursion leaves at every stage.
+
+    K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky factors
+    of Quu and S; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
+    """
+
+    K: Array
+    kff: Array
+    Lu: Array
+    Ls: Array
+    P: Array
+    p: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class White:
+    """Standard normal numbers that become noise: for controls (K, nu) and for defects (K, ndx)."""
+
+    u: Array
+    e: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Step:
+    """What a chain moves by.
+
+    Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise nx, nu alike; the multipliers' step
+    `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx).
+    """
+
+    dx: Array
+    du: Array
+    nx: Array
+    nu: Array
+    rate: Array
+    K: Array
+
+
+def factorize(
+    model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array
+) -> Factorization:
+    """The backward recursion, for multipliers (K, ndx) and penalty mu, a scalar > 0."""
+    identity = jnp.eye(model.A.shape[-1], dtype=model.A.dtype)
+
+    def stage(
+        carry: tuple[Array, Array], inputs: tuple[Array, ...]
+    ) -> tuple[tuple[Array, Array], Factorization]:
+        P, p = carry
+        A, B, h, gx, gu, Hxx, Hux, Huu, multiplier = inputs
+        Ls = cholesky(penalty * identity + P)
+        relaxed = solve(Ls, jnp.column_stack([penalty * P, penalty * p + P @ multiplier]))
+        P_relaxed, p_relaxed = symmetric(relaxed[:, :-1]), relaxed[:, -1]
+        slope = P_relaxed @ h + p_relaxed
+        PA, PB = P_relaxed @ A, P_relaxed @ B
+        Qxx, Qux, Quu = Hxx + A.T @ PA, Hux + B.T @ PA, Huu + B.T @ PB
+        qx, qu = gx + A.T @ slope, gu + B.T @ slope
+        Lu = cholesky(Quu)
+        gains = -solve(Lu, jnp.column_stack([Qux, qu]))
+        K, kff = gains[:, :-1], gains[:, -1]
+        before = symmetric(Qxx + Qux.T @ K), qx + Qux.T @ kff
+        return before, Factorization(K, kff, Lu, Ls, P, p)
+
+    inputs = (model.A, model.B, model.h, cost.gx[:-1], cost.gu, cost.Hxx[:-1], cost.Hux, cost.Huu)
+    end = cost.Hxx[-1], cost.gx[-1]
+    return jax.lax.scan(stage, end, (*inputs, multipliers), reverse=True)[1]
+
+
+def solve_and_sample(
+    model: Linearization, factors: Factorization, multipliers: Array, penalty: Array, white: White
+) -> Step:
+    """The Newton step d = -M^{-1} grad L_mu, one draw n ~ N(0, M^{-1}), and the multipliers' step.
+
+    The last is the costate P dx + p of the quadratic program less the present multipliers.
+    """
+
+    def affine(
+        model: Linearization, factors: Factorization, multiplier: Array, xi_u: Array, xi_s: Array
+    ) -> tuple[Array, Array]:
+        n_u = solve_upper(factors.Lu, xi_u)
+        n_s = solve_upper(factors.Ls, xi_s)
+        step = model.h + model.B @ factors.kff
+        noise = model.B @ n_u
+        closed = model.A + model.B @ factors.K
+        right = jnp.column_stack(
+            [penalty * closed, penalty * step - factors.p + multiplier, penalty * noise]
+        )
+        out = solve(factors.Ls, right)
+        F, f, f_noise = out[:, :-2], out[:, -2], out[:, -1] - n_s
+        return F, jnp.column_stack([f, f_noise])
+
+    F, f = jax.vmap(affine)(model, factors, multipliers, white.u, white.e)
+
+    def compose(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
+        return second[0] @ first[0], second[0] @ first[1] + second[1]
+
+    after = jax.lax.associative_scan(compose, (F, f))[1]  # dx_1..dx_K since dx_0 = 0
+    before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])
+    controls = factors.K @ before
+    du = controls[..., 0] + factors.kff
+    nu = controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
+    dx, nx = after[..., 0], after[..., 1]
+    costate = jnp.einsum("kij,kj->ki", factors.P, dx) + factors.p
+    return Step(dx, du, nx, nu, costate - multipliers, factors.K)
+
+
+@custom_vmap
+def newton(
+    model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array, white: White
+) -> Step:
+    """Newton step and noise of one chain; a batch of chains by whatever suits the device."""
+    factors = factorize(model, cost, multipliers, penalty)
+    return solve_and_sample(model, factors, multipliers, penalty, white)
+
+
+@custom_vmap
+def _batch(*arguments: Any) -> Step:
+    """`newton` of many chains; every array leads with the chain axis."""
+    _, cost, multipliers, _, _ = arguments
+    plain = jax.vmap(newton.fun)
+    fits = multipliers.dtype == jnp.float32 and 0 < cost.gx.shape[-1] <= MAX_NDX
+    if not (fits and 0 < cost.gu.shape[-1] <= MAX_NU and jax.default_backend() == "gpu"):
+        return plain(*arguments)
+    from mjx_drax.kernels.riccati_gpu import (
+        newton_batch,  # only here: importing Pallas takes a second
+    )
+
+    return jax.lax.platform_dependent(*arguments, cuda=newton_batch, default=plain)
+
+
+@newton.def_vmap
+def _over_chains(size: int, batched: Any, *arguments: Any) -> tuple[Step, Step]:
+    """vmap over chains is one call of `_batch`."""
+    return _all_batched(_batch(*_spread(size, batched, arguments)))
+
+
+@_batch.def_vmap
+def _over_problems(size: int, batched: Any, *arguments: Any) -> tuple[Step, Step]:
+    """vmap over problems just makes the batch longer."""
+    spread = _spread(size, batched, arguments)
+    chains = spread[2].shape[1]
+    merged = jax.tree.map(lambda a: a.reshape(size * chains, *a.shape[2:]), spread)
+    step = _batch(*merged)
+    return _all_batched(jax.tree.map(lambda a: a.reshape(size, chains, *a.shape[1:]), step))
+
+
+def _spread(size: int, batched: Any, arguments: Any) -> Any:
+    """The arguments, those that lack the mapped axis repeated along it."""
+    return jax.tree.map(
+        lambda a, b: a if b else jnp.broadcast_to(a, (size, *jnp.shape(a))),
+        arguments,
+        tuple(batched),
+    )
+
+
+def _all_batched(step: Step) -> tuple[Step, Step]:
+    """The result, and that all of it has the mapped axis."""
+    return step, jax.tree.map(lambda _: True, step)

@@ -1,0 +1,1 @@
+"""Helpers to pose a problem: terms of costs, distances, initial guesses."""

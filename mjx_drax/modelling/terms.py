@@ -1,0 +1,402 @@
+"""Residual terms by name: costs and constraints of common tasks from a few lines.
+
+    r(data, u) = sqrt(w) (what is - what is wanted),    so that    1/2 |r|^2 = w/2 |is - wanted|^2
+
+A `Term` is a function like those that a user writes, and goes where they go; `+` stacks residuals,
+of terms and of plain functions. Names are looked up when a term is made. Targets, weights, margins
+and sizes are traced numbers: another value does not recompile. A running residual is summed over
+the knots as it stands, so a weight per second is multiplied by dt by whoever gives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.modelling.distances import DISTANCES, SPHERE, Shape
+from mjx_drax.physics import quaternion
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.mjcf import index, load
+from mjx_drax.problem.dynamics import as_partial
+from mjx_drax.problem.problem import numbers as real_numbers
+
+Names = str | Iterable[str]
+
+
+@register_dataclass
+@dataclass(frozen=True, eq=False)
+class Term:
+    """scale * function(data, u, where, *numbers): a residual r(data, u) or r(data), (n,).
+
+    Attributes:
+        function: the code, a function of a module.
+        where: what it reads: addresses in `mjx.Data`.
+        numbers: targets and sizes, or the terms of a sum.
+        scale: square roots of the weights, (n,) or ().
+    """
+
+    function: Callable[..., Array] = field(metadata=Static)
+    where: tuple[Any, ...] = field(metadata=Static)
+    numbers: tuple[Any, ...]
+    scale: Array
+
+    def __call__(self, data: Any, u: Array | None = None) -> Array:
+        """The residual (n,), at a knot with data and control u, or at the end without u."""
+        return self.scale * self.function(data, u, self.where, *self.numbers)
+
+    def __add__(self, other: Callable[..., Array] | int) -> Term:
+        """Both residuals in one vector, this one's first; `sum` of terms works as well."""
+        return self if isinstance(other, int) and other == 0 else _sum(self, other)
+
+    def __radd__(self, other: Callable[..., Array] | int) -> Term:
+        """The same, the other one's first."""
+        return self if isinstance(other, int) and other == 0 else _sum(other, self)
+
+
+def _sum(*parts: Any) -> Term:
+    if not all(callable(part) for part in parts):
+        raise DraxError(f"{parts} cannot be added: add terms, or functions that return vectors.")
+    return Term(_stacked, (), tuple(map(as_partial, parts)), jnp.ones(()))
+
+
+def _stacked(data: Any, u: Array | None, where: tuple[Any, ...], *parts: Any) -> Array:
+    arguments = (data,) if u is None else (data, u)
+    return jnp.concatenate([jnp.ravel(part(*arguments)) for part in parts])
+
+
+class Terms:
+    """Makes the terms of one model.
+
+    Every method takes `weight`, w >= 0: one number, or one for each element of the residual (0
+    leaves that element free).
+
+    Args:
+        model: MJCF file, XML string or `mujoco.MjModel`.
+
+    Raises:
+        DraxError: by every method, for a name that the model has not (listing those it has), a
+            negative weight, numbers that are not finite, or of the wrong size.
+    """
+
+    def __init__(self, model: str | Path | mujoco.MjModel) -> None:
+        self.model = load(model)
+
+    def posture(
+        self, target: str | ArrayLike | Mapping[str, ArrayLike], *, weight: ArrayLike = 1.0
+    ) -> Term:
+        """Joint positions qpos against a target, (nv,) or as many as the named joints have.
+
+        Hinges [rad] and slides [m] by difference; the quaternion q of a ball or free joint by the
+        rotation vector of target^-1 q [rad], which jumps where the two are half a turn apart.
+
+        Args:
+            target: name of a keyframe, all of qpos (nq,), or {joint: value} with a number, a
+                quaternion (4,) for a ball or a pose (7,) for a free joint.
+        """
+        model = self.model
+        joints = list(range(model.njnt))
+        qpos = np.array(model.qpos0)
+        if isinstance(target, str):
+            qpos = np.array(model.key_qpos[index(model, "keyframe", target)])
+        elif isinstance(target, Mapping):
+            joints = self._indices("joint", target)
+            for joint, (name, value) in zip(joints, target.items(), strict=True):
+                at, size = model.jnt_qposadr[joint], _QPOS[model.jnt_type[joint]]
+                qpos[at : at + size] = _numbers(f"posture of {name!r}", value, size)
+        else:
+            qpos = _numbers("posture", target, model.nq)
+        differences: list[int] = []
+        quaternions: list[int] = []
+        order: list[tuple[bool, int]] = []  # (whether a rotation, its place among its kind)
+        for joint in joints:
+            at, kind = int(model.jnt_qposadr[joint]), model.jnt_type[joint]
+            plain = {_FREE: 3, _BALL: 0}.get(kind, 1)
+            order += [(False, len(differences) + i) for i in range(plain)]
+            differences += range(at, at + plain)
+            if kind in (_FREE, _BALL):
+                order += [(True, 3 * len(quaternions) + i) for i in range(3)]
+                quaternions.append(at + plain)
+                _unit("posture", qpos[at + plain : at + plain + 4])
+        places = [len(differences) * rotation + place for rotation, place in order]
+        where = (tuple(differences), tuple(quaternions), tuple(places))
+        return _term(_posture, where, (qpos,), "posture", len(places), weight)
+
+    def velocity(
+        self, joints: Names | None = None, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0
+    ) -> Term:
+        """qvel [rad/s, m/s] of all joints or of the named ones, against a target of its size."""
+        at: list[int] = list(range(self.model.nv))
+        if joints is not None:
+            at = []
+            for joint in self._indices("joint", joints):
+                start = int(self.model.jnt_dofadr[joint])
+                at += range(start, start + _QVEL[self.model.jnt_type[joint]])
+        wanted = _numbers("target of velocity", target, len(at), alike=True)
+        return _term(_read, ("qvel", tuple(at)), (wanted,), "velocity", len(at), weight)
+
+    def control(
+        self, actuators: Names | None = None, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0
+    ) -> Term:
+        """u of all actuators or of the named ones, against a target of its size; running only."""
+        at = list(range(self.model.nu))
+        if actuators is not None:
+            at = self._indices("actuator", actuators)
+        wanted = _numbers("target of control", target, len(at), alike=True)
+        return _term(_control, tuple(at), (wanted,), "control", len(at), weight)
+
+    def sensor(self, name: str, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0) -> Term:
+        """What a sensor reads, in its units, against a target of its size."""
+        sensor = index(self.model, "sensor", name)
+        start, size = int(self.model.sensor_adr[sensor]), int(self.model.sensor_dim[sensor])
+        wanted = _numbers(f"target of sensor {name!r}", target, size, alike=True)
+        where = ("sensordata", tuple(range(start, start + size)))
+        return _term(_read, where, (wanted,), f"sensor {name!r}", size, weight)
+
+    def site(
+        self,
+        name: str,
+        position: ArrayLike | None = None,
+        orientation: ArrayLike | None = None,
+        *,
+        weight: ArrayLike = 1.0,
+    ) -> Term:
+        """Position of a site against a target [m] (3,), then its orientation [rad] (3,), or either.
+
+        Args:
+            name: the site.
+            position: in the world, (3,).
+            orientation: in the world, a quaternion (4,) or a rotation matrix (3, 3). The residual
+                is the rotation vector from it, in its axes, which jumps at half a turn.
+            weight: one number, or (3,) or (6,).
+        """
+        return self._pose("site", name, position, orientation, weight)
+
+    def body(
+        self,
+        name: str,
+        position: ArrayLike | None = None,
+        orientation: ArrayLike | None = None,
+        *,
+        weight: ArrayLike = 1.0,
+    ) -> Term:
+        """The same for the frame of a body."""
+        return self._pose("body", name, position, orientation, weight)
+
+    def upright(
+        self,
+        body: str,
+        axis: ArrayLike = (0, 0, 1),
+        up: ArrayLike = (0, 0, 1),
+        *,
+        weight: Any = 1.0,
+    ) -> Term:
+        """R axis - up (3,): an axis of a body along a direction of the world, smooth everywhere."""
+        at = (index(self.model, "body", body),)
+        ends = [_unit(k, _numbers(k, v, 3)) for k, v in (("axis", axis), ("up", up))]
+        return _term(_upright, at, ends, f"upright {body!r}", 3, weight)
+
+    def centre_of_mass(
+        self, position: ArrayLike, body: str | None = None, *, weight: ArrayLike = 1.0
+    ) -> Term:
+        """Centre of mass [m] (3,) of the model, or of a body and what it carries, to a target."""
+        at = 0 if body is None else index(self.model, "body", body)
+        wanted = _numbers("position of centre_of_mass", position, 3)
+        return _term(_read, ("subtree_com", at), (wanted,), "centre_of_mass", 3, weight)
+
+    def clearance(self, geoms: Names, others: Names, *, margin: ArrayLike = 0.0) -> Term:
+        """margin - distance [m], (n,), <= 0 where geoms keep their distance: an inequality.
+
+        One value for each of `geoms` with each of `others`, the latter running faster. Distances
+        are signed; `mjx_drax.distances` says for which pairs they are exact (all but two kinds).
+
+        Args:
+            geoms: name or names.
+            others: name or names.
+            margin: one number, or (n,).
+
+        Raises:
+            DraxError: also for a geom with itself, and for kinds that have no distance function.
+        """
+        model = self.model
+        sizes = np.where((model.geom_type == SPHERE)[:, None], [1.0, 0, 0], 1.0) * model.geom_size
+        groups: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+        firsts, seconds = (self._indices("geom", names) for names in (geoms, others))
+        for a in firsts:
+            for b in seconds:
+                low, high = sorted((a, b), key=lambda g: int(model.geom_type[g]))
+                kinds = int(model.geom_type[low]), int(model.geom_type[high])
+                if a == b or kinds not in DISTANCES:
+                    raise DraxError(_no_distance(model, a, b))
+                count = sum(map(len, groups.values()))
+                groups.setdefault(kinds, []).append((low, high, count))
+        pairs = [pair for group in groups.values() for pair in group]
+        order = tuple(int(i) for i in np.argsort([place for *_, place in pairs]))
+        where = tuple((kinds, *zip(*group, strict=True)) for kinds, group in groups.items())
+        wanted = _numbers("margin of clearance", margin, len(pairs), alike=True)
+        used = tuple(sizes[np.array(group)[:, :2]] for group in groups.values())
+        return _term(_clearance, (where, order), (wanted, *used), "clearance", len(pairs), 1.0)
+
+    def _pose(
+        self,
+        kind: str,
+        name: str,
+        position: ArrayLike | None,
+        orientation: ArrayLike | None,
+        weight: ArrayLike,
+    ) -> Term:
+        model, label, at = self.model, f"{kind} {name!r}", index(self.model, kind, name)
+        size = 3 * ((position is not None) + (orientation is not None))
+        if not size:
+            raise DraxError(f"{label} has no target: give a position, an orientation or both.")
+        weights, parts = _weights(label, size, weight), []
+        if position is not None:
+            wanted = _numbers(f"position of {label}", position, 3)
+            where = ("site_xpos" if kind == "site" else "xpos", at)
+            parts.append(_term(_read, where, (wanted,), label, 3, weights[:3]))
+        if orientation is not None:
+            # A site is turned by a fixed quaternion within its body, whose own is in mjx.Data.
+            body, turned = at, np.array([1.0, 0.0, 0.0, 0.0])
+            if kind == "site":
+                body, turned = int(model.site_bodyid[at]), model.site_quat[at]
+            wanted = _quaternion(f"orientation of {label}", orientation)
+            parts.append(_term(_orientation, (body,), (wanted, turned), label, 3, weights[-3:]))
+        return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+
+    def _indices(self, kind: str, names: Names) -> list[int]:
+        listed = [names] if isinstance(names, str) or not isinstance(names, Iterable) else names
+        found = [index(self.model, kind, name) for name in listed]
+        if not found:
+            raise DraxError(f"no {kind} is named: give at least one name.")
+        return found
+
+
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_QPOS = np.array([7, 4, 1, 1])  # numbers in a free, ball, slide and hinge joint's position
+_QVEL = np.array([6, 3, 1, 1])
+
+
+# The residuals: functions of data, control, addresses and numbers
+
+
+def _read(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
+    name, at = where
+    return getattr(data, name)[np.array(at)] - target
+
+
+def _control(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
+    if u is None:
+        raise DraxError("a control term was called without u: there is no control at the end. Use "
+                        "it in the running cost or in the constraints of the stages.")  # fmt: skip
+    return u[np.array(where)] - target
+
+
+def _posture(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
+    differences, quaternions, places = (np.array(part, int) for part in where)
+    parts = [data.qpos[differences] - target[differences]]
+    if len(quaternions):
+        at = quaternions[:, None] + np.arange(4)
+        parts.append(quaternion.between(target[at], data.qpos[at]).ravel())
+    return jnp.concatenate(parts)[places]
+
+
+def _orientation(
+    data: Any, u: Array | None, where: tuple[Any, ...], target: Array, turned: Array
+) -> Array:
+    return quaternion.between(target, quaternion.multiply(data.xquat[where[0]], turned))
+
+
+def _upright(data: Any, u: Array | None, where: tuple[Any, ...], axis: Array, up: Array) -> Array:
+    return data.xmat[where[0]] @ axis - up
+
+
+def _clearance(
+    data: Any, u: Array | None, where: tuple[Any, ...], margin: Array, *sizes: Array
+) -> Array:
+    groups, order = where
+    distances = []
+    for (kinds, low, high, _), size in zip(groups, sizes, strict=True):
+        shapes = [
+            Shape(data.geom_xpos[at], data.geom_xmat[at], size[:, side])
+            for side, at in enumerate((np.array(low), np.array(high)))
+        ]
+        distances.append(jax.vmap(DISTANCES[kinds])(*shapes))
+    return margin - jnp.concatenate(distances)[np.array(order)]
+
+
+# What a user gives
+
+
+def _numbers(label: str, value: Any, size: int, alike: bool = False) -> np.ndarray:
+    """Finite numbers (size,); one number stands for all if there is one, or if they are alike."""
+    try:
+        array = real_numbers(value)
+    except (TypeError, ValueError) as error:
+        raise DraxError(f"{label} is {shown(value)}: give {size} number(s).") from error
+    one = array.ndim == 0 and (alike or size == 1)
+    if (not one and array.shape != (size,)) or not np.isfinite(array).all():
+        give = f"one number, or {size}" if alike and size != 1 else f"{size} number(s)"
+        raise DraxError(f"{label} is {shown(value)}: give {give}, all finite.")
+    return np.broadcast_to(array, (size,))
+
+
+def _unit(label: str, vector: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    if length < 1e-9:
+        raise DraxError(f"{label} has the direction or quaternion {vector}: it must not be zero.")
+    return vector / length
+
+
+def _quaternion(label: str, value: Any) -> np.ndarray:
+    """A unit quaternion (4,) from one of any length, or from a rotation matrix (3, 3)."""
+    if np.shape(value) != (3, 3):
+        return _unit(label, _numbers(f"{label} (a quaternion, or a matrix (3, 3))", value, 4))
+    matrix = _numbers(label, np.ravel(value), 9).reshape(3, 3)
+    if np.abs(matrix.T @ matrix - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
+        raise DraxError(
+            f"{label} is {shown(matrix.tolist())}: give a rotation matrix, R'R = I, det R = 1."
+        )
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, matrix.ravel())
+    return quaternion
+
+
+def _weights(label: str, size: int, weight: ArrayLike) -> np.ndarray:
+    weights = _numbers(f"weight of {label}", weight, size, alike=True)
+    if (weights < 0).any():
+        raise DraxError(
+            f"weight of {label} is {shown(weight)}: give numbers that are not negative."
+        )
+    return weights
+
+
+def _term(
+    function: Callable[..., Array],
+    where: tuple[Any, ...],
+    numbers: Iterable[np.ndarray],
+    label: str,
+    size: int,
+    weight: ArrayLike,
+) -> Term:
+    scale = jnp.sqrt(jnp.asarray(_weights(label, size, weight)))
+    return Term(function, where, tuple(map(jnp.asarray, numbers)), scale)
+
+
+def _no_distance(model: mujoco.MjModel, a: int, b: int) -> str:
+    names = [model.geom(g).name for g in (a, b)]
+    if a == b:
+        return f"clearance of geom {names[0]!r} with itself: give two different geoms."
+    kinds = [mujoco.mjtGeom(model.geom_type[g]).name[7:].lower() for g in (a, b)]
+    return (
+        f"clearance between {names[0]!r} ({kinds[0]}) and {names[1]!r} ({kinds[1]}): there is no "
+        "distance function for this pair. Put spheres, capsules or boxes around one of them."
+    )

@@ -1,0 +1,212 @@
+"""What becomes of a model, and how far MJX is from MuJoCo's C engine in it: `mjx-drax check`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_drax.base.errors import DraxError
+from mjx_drax.physics import step as physics
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.agreement import WRONG, Engine, compare, probes
+from mjx_drax.physics.mjcf import (
+    bounded_joints,
+    initial_state,
+    load,
+    model_name,
+    require_movable,
+    require_regular,
+    require_traceable,
+    steps_between_knots,
+)
+from mjx_drax.physics.mjx_model import (
+    constraint_rows,
+    contact_pairs,
+    contact_points,
+    differences,
+    moments,
+    nearest_only,
+    twin,
+)
+
+Report = dict[str, Any]
+
+
+def check(
+    source: str | Path | mujoco.MjModel, progress: Callable[[str], None] = lambda line: None
+) -> Report:
+    """What `mjx-drax check` prints, as numbers and words that JSON can hold.
+
+    Args:
+        source: MJCF file, XML string or `mujoco.MjModel`.
+        progress: called with a line before what takes long.
+
+    Returns:
+        `sizes`, `timing`, `joints`, `actuators`, `contact_pairs`, `contact_points` (`all`, those
+        that a plan has `kept`, and of how many it keeps `nearest` of each friction dimension, None
+        if all), `differences`, `agreement` (None where the step could not be compiled) and
+        `obstacle`: a sentence, or None if the model can be used.
+
+    Raises:
+        DraxError: the file is missing or MuJoCo cannot compile it.
+    """
+    model = load(source)
+    name = model_name(model)
+    steps = steps_between_knots(model, None)
+    report: Report = {
+        "model": name,
+        "sizes": {
+            "nq": model.nq,
+            "nv": model.nv,
+            "nu": model.nu,
+            "na": model.na,
+            "ndx": 2 * model.nv + model.na,
+            "constraint_rows": None,
+        },
+        "timing": {
+            "timestep": model.opt.timestep,
+            "dt": steps * model.opt.timestep,
+            "integrator": mujoco.mjtIntegrator(model.opt.integrator).name[6:],
+        },
+        "joints": [],
+        "actuators": [_actuator(model, a) for a in range(model.nu)],
+        "contact_pairs": sum(1 for _ in contact_pairs(model)),
+        "contact_points": {"all": None, "kept": None, "nearest": None},
+        "differences": differences(model),
+        "agreement": None,
+        "obstacle": None,
+    }
+    try:
+        require_movable(model, name)
+        x_init = initial_state(model, name, None)
+        require_regular(model, name, x_init)
+        bounded = bounded_joints(model, x_init)
+        report["joints"] = _joints(model, bounded)
+        planned = twin(model, bounded=bounded)
+        report["sizes"]["constraint_rows"] = constraint_rows(planned)
+        report["contact_points"] = {
+            "all": len(contact_points(twin(model, np.iinfo(int).max))),
+            "kept": len(contact_points(planned)),
+            "nearest": nearest_only(planned),
+        }
+        progress(f"{name}: compiling one step of MJX and its derivatives ...")
+        require_traceable(name, partial(physics.forward, planned), model)
+        report["agreement"] = _agreement(model, x_init, bounded)
+        error = report["agreement"]["velocity_error"]
+        if not error <= WRONG:
+            reasons = "; ".join(report["differences"]) or "for no reason that is known"
+            report["obstacle"] = (
+                f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities: "
+                f"{reasons}."
+            )
+    except DraxError as error:
+        report["obstacle"] = str(error)
+    return report
+
+
+def _agreement(model: mujoco.MjModel, x_init: np.ndarray, bounded: np.ndarray) -> Report:
+    at = probes(Engine(model), x_init, bounded)
+    found = compare(model, at, bounded=bounded, derivatives=True)
+    return {
+        "velocity_error": float(found.velocity.max()),
+        "velocity_error_at_x_init": float(found.velocity[0]),
+        "states": len(at.x),
+        "jacobian_error_at_x_init": found.jacobian,
+    }
+
+
+def _joints(model: mujoco.MjModel, bounded: np.ndarray) -> list[Report]:
+    """What becomes of every joint."""
+    pulls, found = np.abs(moments(model)) > 0, []
+    for j in range(model.njnt):
+        limited = bool(model.jnt_limited[j])
+        actuators = np.flatnonzero(pulls[:, model.dof_jntid == j].any(axis=1))
+        range_ = model.jnt_range[j].tolist() if limited else None
+        found.append(
+            {
+                "name": _name(model.joint(j), f"joint {j}"),
+                "type": mujoco.mjtJoint(model.jnt_type[j]).name[6:].lower(),
+                "range": range_,
+                "range_is": "none" if not limited else "bound" if bounded[j] else "physics",
+                "driven_by": [_name(model.actuator(a), f"actuator {a}") for a in actuators],
+            }
+        )
+    return found
+
+
+def _actuator(model: mujoco.MjModel, a: int) -> Report:
+    kind = "motor"
+    if model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
+        kind = "muscle"
+    elif model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
+        kind = "servo"
+    if model.actuator_actnum[a]:
+        kind += " with state"
+    transmission = mujoco.mjtTrn(model.actuator_trntype[a]).name[6:].lower()
+    target = int(model.actuator_trnid[a, 0])
+    of = {"joint": model.joint, "jointinparent": model.joint, "tendon": model.tendon,
+          "site": model.site, "body": model.body}.get(transmission)  # fmt: skip
+    named = _name(of(target), str(target)) if of else str(target)
+    limited = bool(model.actuator_ctrllimited[a])
+    return {
+        "name": _name(model.actuator(a), f"actuator {a}"),
+        "kind": kind,
+        "drives": f"{transmission} {named}",
+        "range": model.actuator_ctrlrange[a].tolist() if limited else None,
+    }
+
+
+def _name(element: Any, otherwise: str) -> str:
+    return str(element.name or otherwise)
+
+
+def text(report: Report) -> str:
+    """The report for a person."""
+    sizes, timing = report["sizes"], report["timing"]
+    rows, points = sizes["constraint_rows"], report["contact_points"]
+    if points["kept"] == points["all"]:
+        kept = "all of them in a plan"
+    else:
+        kept = f"a plan keeps {points['kept']}, the nearest {points['nearest']} of each condim"
+    lines = [
+        f"model        {report['model']}",
+        "sizes        " + ", ".join(f"{k} {sizes[k]}" for k in ("nq", "nv", "nu", "na", "ndx")),
+        f"constraints  {'unknown' if rows is None else rows} rows, "
+        f"{report['contact_pairs']} pairs of geoms that may touch",
+        f"contacts     {'unknown' if rows is None else points['all']} points, {kept}",
+        f"time         timestep {timing['timestep']:g} s, dt {timing['dt']:g} s, "
+        f"integrator {timing['integrator']}",
+    ]
+    words = {"bound": "a bound on knots", "physics": "a limit in the dynamics"}
+    for joint in report["joints"]:
+        where = words.get(joint["range_is"])
+        range_ = f"range {_range(joint['range'])} is {where}" if where else "no range"
+        driven = (
+            "driven by " + ", ".join(joint["driven_by"]) if joint["driven_by"] else "not driven"
+        )
+        lines.append(f"joint        {joint['name']}: {joint['type']}, {range_}, {driven}")
+    for actuator in report["actuators"]:
+        range_ = _range(actuator["range"]) if actuator["range"] else "without limits"
+        lines.append(
+            f"actuator     {actuator['name']}: {actuator['kind']} on {actuator['drives']}, "
+            f"control {range_}"
+        )
+    found = report["agreement"]
+    if found:
+        lines += [
+            f"one step     velocities within {found['velocity_error']:.1e} of MuJoCo's C engine "
+            f"in {found['states']} states ({found['velocity_error_at_x_init']:.1e} at x_init)",
+            f"derivatives  within {found['jacobian_error_at_x_init']:.1e} of the C engine's finite "
+            "differences at x_init, relative to the largest",
+        ]
+    lines += [f"differs      {sentence}" for sentence in report["differences"]]
+    obstacle = report["obstacle"]
+    return "\n".join([*lines, "CAN BE USED" if obstacle is None else f"CANNOT BE USED: {obstacle}"])
+
+
+def _range(ends: list[float]) -> str:
+    return f"{ends[0]:.4g} to {ends[1]:.4g}"

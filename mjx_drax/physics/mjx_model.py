@@ -1,0 +1,390 @@
+"""The MJX twin of a MuJoCo model: what is planned with, beside the model that certifies.
+
+MJX computes the same physics from the same `mujoco.MjModel`, with exceptions. Some are mended on a
+copy, where an equal model exists that MJX knows (a solver, a flag, a disabled group). Some MJX
+refuses; the refusal is put in words. Some it computes differently without saying so; `differences`
+names those that a model has. What is left is for the certificate to find.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.physics._mjx import geom_pairs, has_collision_fn
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.states import quiet
+from mjx_drax.physics.step import mjx
+
+_DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
+_SENSORS = {int(kind) for kind in mjx.SensorType}
+_TOUCHED = (mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT)
+_NET_FORCE = 3
+"""How contact sensors say reduce="netforce"."""
+
+NEAREST = 32
+"""Contact points of each friction dimension (condim) that a plan keeps, if it is not told how many:
+as many as eight boxes on the floor have. A step with half as many takes as long."""
+
+_LIMIT = "max_contact_points"
+"""The custom number of a model that MJX keeps so many contact points by."""
+
+
+def twin(
+    model: mujoco.MjModel, contacts: bool | int = True, bounded: np.ndarray | None = None
+) -> mjx.Model:
+    """The MJX model of a MuJoCo model.
+
+    Args:
+        model: which is not changed.
+        contacts: False leaves contacts out; a number keeps so many contact points of each friction
+            dimension (condim), the nearest ones in every state; True keeps `NEAREST`.
+        bounded: joints whose limits the knots keep to, (njnt,). Inside them the limit's force is
+            zero, so its constraint row is left out; the C engine keeps it.
+
+    Raises:
+        DraxError: MJX does not support the model; says what and what to do.
+    """
+    if contacts is not True and not (isinstance(contacts, int | np.integer) and contacts >= 0):
+        raise DraxError(f"contacts is {shown(contacts)}: give True, False or a whole number.")
+    mended = copy.deepcopy(model)
+    if bounded is not None:
+        mended.jnt_limited[bounded] = 0
+    if not contacts:
+        mended.opt.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
+    _mend(mended)
+    try:
+        on_device = mjx.put_model(mended, device=jax.local_devices()[0], impl="jax")
+        on_device = _with_nearest(on_device, contacts)
+    except (NotImplementedError, ValueError) as error:
+        raise DraxError(_refusal(mended, str(error))) from error
+    if not model.nmat:  # MJX's rangefinders look up materials, whether there are any or not
+        on_device = on_device.replace(mat_rgba=np.ones((1, 4), np.float32))
+    # MJX commits its arrays to a device. What is computed from them is then committed as well, and
+    # a loop that is fed its own output would be compiled a second time. (`asarray` would compile a
+    # program for every shape.)
+    placed: mjx.Model = jax.device_put(_with_springs(jax.tree.map(np.asarray, on_device)))
+    return placed
+
+
+def _with_nearest(model: mjx.Model, contacts: bool | int) -> mjx.Model:
+    """The model with no more than the nearest contact points, where it has more.
+
+    MJX reads how many to keep from a custom number of the model. It is added here, not in the MJCF,
+    because a model may come compiled. MJX's other number, `max_geom_pairs`, is left alone: it
+    chooses pairs by spheres about them before it knows distances, and so loses contacts.
+    """
+    points = NEAREST if contacts is True else int(contacts)
+    if np.bincount(contact_points(model), minlength=1).max() <= points:
+        return model
+    return model.replace(
+        nnumeric=model.nnumeric + 1,
+        # MJX takes the i-th entry for the i-th number, though numbers may have several entries
+        numeric_data=np.append(model.numeric_data[model.numeric_adr], points),
+        numeric_adr=np.arange(model.nnumeric + 1),
+        name_numericadr=np.append(model.name_numericadr, len(model.names)),
+        names=model.names + _LIMIT.encode() + b"\0",  # the last of this name counts
+    )
+
+
+def _with_springs(model: mjx.Model) -> mjx.Model:
+    """The model, whose tendon springs have a derivative at rest too.
+
+    MJX finds no force in a tendon that is neither longer nor shorter than its spring, and so no
+    stiffness either. Now it is longer, by the last digit.
+    """
+    lower, upper = model.tendon_lengthspring.T
+    upper = np.where(lower == upper, np.nextafter(upper, upper.dtype.type(-np.inf)), upper)
+    return model.replace(tendon_lengthspring=np.stack([lower, upper], axis=1))
+
+
+def _mend(model: mujoco.MjModel) -> None:
+    """Change a model into one that MJX knows, with the same motions (or nearly: `differences`)."""
+    opt = model.opt
+    opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # M as `physics` has it
+    opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all find the same minimum
+    if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+        opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
+    springs, dampers = int(_DISABLE.mjDSBL_SPRING), int(_DISABLE.mjDSBL_DAMPER)
+    if opt.disableflags & springs:
+        model.jnt_stiffness[:] = 0.0
+        model.tendon_stiffness[:] = 0.0
+    if opt.disableflags & dampers:
+        model.dof_damping[:] = 0.0
+        model.tendon_damping[:] = 0.0
+    if not (opt.disableflags & springs and opt.disableflags & dampers):
+        # With one of the two flags set, MJX leaves out all passive forces; MuJoCo, with both
+        opt.disableflags &= ~(springs | dampers)
+    if opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+        # Otherwise MJX refuses what it cannot collide
+        model.geom_contype[:] = 0
+        model.geom_conaffinity[:] = 0
+    touching = next(geom_pairs(model), None) is not None
+    if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
+        # Nothing has a friction cone, and MJX fails where there are no elliptic ones
+        opt.cone = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    if not touching:  # MJX looks for contacts, and finds no array of them
+        touch = np.isin(model.sensor_type, [int(kind) for kind in _TOUCHED])
+        model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
+    model.actuator_gainprm[disabled(model)] = 0.0
+    model.actuator_biasprm[disabled(model)] = 0.0
+    # `differences` names them
+    model.sensor_type[_unknown_sensors(model)] = int(mujoco.mjtSensor.mjSENS_CLOCK)
+
+
+def disabled(model: mujoco.MjModel) -> np.ndarray:
+    """Actuators that are switched off, by their group or all, (nu,)."""
+    if model.opt.disableflags & _DISABLE.mjDSBL_ACTUATION:
+        return np.ones(model.nu, bool)
+    groups, off = model.actuator_group, int(model.opt.disableactuator)
+    return np.array([0 <= g < 31 and bool(off >> int(g) & 1) for g in groups], bool)
+
+
+def _unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
+    """Sensors that MJX does not compute, (nsensor,)."""
+    unknown = np.array([int(kind) not in _SENSORS for kind in model.sensor_type], bool)
+    between = np.stack([model.sensor_objtype, model.sensor_reftype], axis=1)
+    body = (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+    refused = np.isin(between, [int(kind) for kind in body]).any(axis=1)
+    refused |= model.sensor_intprm[:, 1] == _NET_FORCE
+    return unknown | refused & (model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
+
+
+def _refusal(model: mujoco.MjModel, reason: str) -> str:
+    """What MJX said, with the elements that it means and what to do about them."""
+    if "collisions not implemented" in reason or "margin/gap" in reason:
+        return _not_collided(model)
+    if "condim" in reason.lower() or "ELLIPTIC" in reason:
+        return f'{reason}: set <option cone="pyramidal"/>, or condim="3" on all geoms.'
+    if "fluid drag" in reason:
+        return (
+            f'{reason.rstrip(".")}: set <option integrator="Euler"/>, or no density and viscosity.'
+        )
+    if "Flex" in reason:
+        return "the model has flexible bodies (flex), which MJX does not simulate: remove them."
+    for names, fix in (
+        (("mjtTrn",), "drive joints, tendons or sites instead"),
+        (("mjtDyn", "mjtGain", "mjtBias"), "use motors, position or velocity servos, or muscles"),
+        (("mjtEq",), "remove these equality constraints"),
+        (("mjtWrap",), "route tendons over spheres and cylinders"),
+        (("mjtEnableBit", "mjENBL"), "clear this flag"),
+    ):
+        if any(name in reason for name in names):
+            return f"MJX does not support {reason}: {fix}."
+    return f"MJX does not support this model: {reason}"
+
+
+def _not_collided(model: mujoco.MjModel) -> str:
+    """All that MJX cannot collide: of each two types of geoms one pair, and how many there are."""
+    types: dict[tuple[str, str], list[str]] = {}
+    margins: dict[tuple[str, str], list[str]] = {}
+    for a, b, pair in geom_pairs(model):
+        one, other = (_GEOM(model.geom_type[g]).name[len("mjGEOM_") :].lower() for g in (a, b))
+        margin = model.pair_margin[pair] if pair >= 0 else model.geom_margin[[a, b]].sum()
+        if not has_collision_fn(*model.geom_type[[a, b]]):
+            found = types
+        elif margin and {"mesh", "hfield"} & {one, other}:
+            found = margins
+        else:
+            continue
+        names = f"{geom_name(model, a)!r} and {geom_name(model, b)!r}"
+        found.setdefault((one, other), []).append(names)
+
+    def listed(found: dict[tuple[str, str], list[str]]) -> str:
+        counts = {
+            k: f", one of {len(v)} such pairs" if len(v) > 1 else "" for k, v in found.items()
+        }
+        return ", ".join(f"{v[0]} ({k[0]} with {k[1]}{counts[k]})" for k, v in found.items())
+
+    reasons = []
+    if types:
+        odd = sorted({kind for kinds in types for kind in kinds} & {"cylinder", "ellipsoid", "sdf"})
+        reasons.append(
+            f"cannot collide geoms {listed(types)}: make each {' and '.join(odd)} among them a "
+            "capsule, sphere, box or mesh"
+        )
+    if margins:
+        reasons.append(
+            "knows no margins of meshes and height fields, "
+            f'here of geoms {listed(margins)}: set margin="0" on both'
+        )
+    return (
+        f"MJX {', and '.join(reasons)}; or keep them apart by contype and conaffinity, or plan "
+        "with contacts=False."
+    )
+
+
+def geom_name(model: mujoco.MjModel, g: int) -> str:
+    """A geom's name, or its number and body."""
+    geom = model.geom(g)
+    body = int(geom.bodyid[0])
+    return str(geom.name or f"geom {g} of body {model.body(body).name or body}")
+
+
+def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
+    """All pairs of geoms between which MuJoCo may make a contact."""
+    if model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+        return
+    yield from zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    type_, affinity, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+    weld = model.body_weldid[body]
+    parent = model.body_weldid[model.body_parentid[weld]]
+    masks = (type_[:, None] & affinity) | (type_ & affinity[:, None])
+    apart = weld[:, None] != weld
+    if not model.opt.disableflags & _DISABLE.mjDSBL_FILTERPARENT:
+        related = (weld[:, None] == parent) | (parent[:, None] == weld)
+        apart &= ~(related & (weld[:, None] != 0) & (weld != 0))
+    excluded = {int(s) for s in model.exclude_signature}
+    for a, b in np.argwhere(np.triu((masks != 0) & apart, 1)).tolist():
+        low, high = sorted((int(body[a]), int(body[b])))
+        if (low << 16) + high not in excluded:
+            yield a, b
+
+
+_ROUGH = {
+    frozenset(kinds)
+    for kinds in (
+        (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID),
+        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
+        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_ELLIPSOID),
+        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CAPSULE),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SPHERE),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_CAPSULE),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_BOX),
+        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_MESH),
+        (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_BOX),
+    )
+}
+"""Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 1."""
+
+
+def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]:
+    """What MJX computes differently from the C engine in this model, a sentence each.
+
+    Found by comparing one step of both over many models: each moved velocities by 2e-5 to 0.7.
+    """
+    opt, found = model.opt, []
+
+    def note(condition: Any, text: str) -> None:
+        if np.any(condition):
+            found.append(text)
+
+    note(
+        opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT,
+        'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
+    )
+    note(
+        opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        'integrator "implicitfast" has other derivatives of velocities in MJX: prefer "Euler"',
+    )
+    note(opt.enableflags & _ENABLE.mjENBL_SLEEP, "bodies do not fall asleep: clear the flag sleep")
+    note(opt.noslip_iterations, "noslip_iterations are not made: set them to 0")
+    note(
+        np.any(model.jnt_stiffnesspoly) or np.any(model.tendon_stiffnesspoly),
+        "polynomial stiffness is left out: use linear springs",
+    )
+    note(
+        np.any(model.dof_dampingpoly) or np.any(model.tendon_dampingpoly),
+        "polynomial damping is left out: use linear dampers",
+    )
+    note(model.actuator_actearly, "early activation (actearly) is left out: set it to false")
+    note(model.actuator_delay, "actuators' delays are left out: remove them")
+    note(model.nplugin, "plugins are left out: remove them")
+    note(
+        np.any(model.actuator_damping) or np.any(model.actuator_armature),
+        "actuators' own damping and armature are left out: give them to the joints",
+    )
+    pair = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
+    note(
+        np.isin(model.eq_type, pair),
+        "connect and weld constraints pull a little differently: prefer joints",
+    )
+    note(model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box")
+    for i in np.flatnonzero(_unknown_sensors(model)):
+        found.append(f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs")
+    if contacts:
+        for a, b in contact_pairs(model):
+            kinds = frozenset((_GEOM(model.geom_type[a]), _GEOM(model.geom_type[b])))
+            if kinds in _ROUGH:
+                found.append(
+                    f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
+                    "differ: use spheres, capsules and planes"
+                )
+                break
+    return found
+
+
+def moment_arms(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Moment arms (nu, nv): generalized forces are their transpose times the actuators' forces."""
+    moment, at = np.zeros((model.nu, model.nv)), (data.moment_rownnz, data.moment_rowadr)
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, *at, data.moment_colind)
+    return moment
+
+
+def moments(model: mujoco.MjModel) -> np.ndarray:
+    """Of a unit of every actuator's force, the largest force on every velocity, (nu, nv).
+
+    Over the default pose and two random ones, because what pulls at what depends on the pose.
+    """
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    largest = np.zeros((model.nu, model.nv))
+    for _ in range(3):
+        with quiet():
+            mujoco.mj_forward(model, data)
+        largest = np.maximum(largest, np.abs(moment_arms(model, data)))
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+    largest[disabled(model)] = 0.0
+    return largest
+
+
+def driven(model: mujoco.MjModel) -> np.ndarray:
+    """Joints that an actuator pulls at in the default pose or another, (njnt,)."""
+    joints = np.zeros(model.njnt, bool)
+    joints[model.dof_jntid[moments(model).sum(axis=0) > 0]] = True
+    return joints
+
+
+def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
+    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
+
+
+def control_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of controls, (nu,) each: the model's, or +-1 where it has none."""
+    limited = model.actuator_ctrllimited.astype(bool)[:, None]
+    lower, upper = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    return lower, upper
+
+
+def constraint_rows(model: mjx.Model) -> int:
+    """Rows that constraint forces are solved for in a step, whether they are active or not."""
+    return int(jax.eval_shape(mjx.make_data, model)._impl.efc_J.shape[0])
+
+
+def contact_points(model: mjx.Model) -> np.ndarray:
+    """Friction dimensions (condim) of the contact points in a step, (n,), active or not."""
+    return np.asarray(jax.eval_shape(mjx.make_data, model)._impl.contact.dim, int)
+
+
+def nearest_only(model: mjx.Model) -> int | None:
+    """Of how many contact points of a friction dimension a step knows the forces; None: of all."""
+    i = mjx.name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _LIMIT)
+    return int(model.numeric_data[i]) if i >= 0 and model.numeric_data[i] >= 0 else None
+
+
+def has_constraints(model: mjx.Model) -> bool:
+    """Whether a step of the model solves for constraint forces."""
+    return constraint_rows(model) > 0

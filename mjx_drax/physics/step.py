@@ -1,0 +1,211 @@
+"""One step of MJX, with derivatives that hold at rest and in contact.
+
+Five things differ from `mjx.step`, all but the last not in value:
+
+- Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
+  acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), whose law s is MJX's. Newton's method
+  finds the minimum a* without tangents, and one more Newton step, a* - H^{-1} grad(a*), carries
+  them: where grad = 0 its derivative is the implicit function theorem's, da = -H^{-1} d grad.
+- Positions are integrated by `joints`, whose quaternions have derivatives at rest. The
+  semi-implicit integrators end with this, so only the end is replaced; Runge-Kutta integrates at
+  every stage and is written out.
+- The forces of springs on ball and free joints go through the same quaternions.
+- What adds up along the tree of bodies is computed without walking along it, by `tree`, and the
+  inertia M is dense and factorized by `linalg`.
+- Boxes on planes have the contacts of the C engine; see `collision`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax.kernels.linalg import cholesky, solve, symmetric
+from mjx_drax.physics._mjx import Context
+from mjx_drax.physics._mjx import mjx as mjx
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.collision import collision
+from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
+
+TURNING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+
+ITERATIONS, SIZES = 20, 8
+"""Newton's method for constraint forces: iterations at most, and step sizes that it chooses from,
+each half the one before."""
+
+SLIGHT = 1e-3
+"""Share of the decrease that a step promised, below which another would be no use: in float32, or
+where constraints are about to switch, costs go on falling by next to nothing."""
+
+RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
+"""Of each stage: how far it goes along the last stage's rate, and its weight in the sum."""
+
+
+def state(data: mjx.Data) -> Array:
+    """x = [qpos, qvel, act], (nx,)."""
+    return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+
+def data_at(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
+    """`mjx.Data` holding a state (nx,) and a control (nu,)."""
+    qpos, qvel, act = jnp.split(x, [model.nq, model.nq + model.nv])
+    return mjx.make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
+
+
+def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
+    """Everything that follows from a state (nx,) and a control (nu,): positions to accelerations.
+
+    What the caller does not read is not computed, once this is compiled.
+    """
+    data = data_at(model, x, u)
+    turned = np.isin(model.jnt_type, TURNING)
+    if turned.any():
+        data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
+        model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
+    data = mjx.sensor_pos(model, _at_positions(model, data))
+    data = mjx.sensor_vel(model, _at_velocities(model, data))
+    data = _accelerated(model, mjx.fwd_actuation(model, data))
+    return mjx.sensor_acc(model, _constrained(model, data))
+
+
+def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_position`, without its walks along the tree and factors of M."""
+    data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
+    data = mass_matrix(model, mjx.tendon(model, data))
+    data = collision(model, mjx.tendon_armature(model, data))
+    return mjx.transmission(model, mjx.make_constraint(model, data))
+
+
+def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_velocity`, without its walks along the tree."""
+    data = data.tree_replace(
+        {
+            "_impl.actuator_velocity": data._impl.actuator_moment @ data.qvel,
+            "_impl.ten_velocity": data._impl.ten_J @ data.qvel,
+        }
+    )
+    data = rne(model, mjx.passive(model, com_vel(model, data)))
+    return mjx.tendon_bias(model, data)
+
+
+def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_acceleration`: `data` with the acceleration that constraints do not change."""
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    force = force + data.qfrc_applied + mjx.xfrc_accumulate(model, data)
+    qacc = solve(cholesky(data._impl.M), force)
+    return data.replace(qfrc_smooth=force, qacc_smooth=qacc)
+
+
+def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
+    """Forces (nv,) of the springs of ball and free joints, which are those `turned`, (njnt,)."""
+    away = Joints.of(model).difference(qpos, model.qpos_spring)
+    stiffness = jnp.where(turned, model.jnt_stiffness, 0.0)
+    return -stiffness[model.dof_jntid] * away
+
+
+def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`data` with the acceleration and forces that constraints leave."""
+    if data._impl.efc_J.size == 0:
+        return data.replace(qacc=data.qacc_smooth)
+
+    def law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Context]:
+        """The slope of what the acceleration minimizes, (nv,), and constraint forces."""
+        forces = Context.create(model, data.replace(qacc=qacc), grad=False)
+        return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
+
+    given = model, data
+    frozen = jax.lax.stop_gradient(given)
+
+    def hessian(qacc: Array) -> Array:
+        return symmetric(jax.jacfwd(lambda a: law(*frozen, a)[0])(qacc))
+
+    found = _minimum(partial(law, *frozen), hessian, frozen[1].qacc_smooth)
+    qacc = found - solve(cholesky(hessian(found)), law(*given, found)[0])
+    _, forces = law(*given, qacc)
+    return data.replace(
+        qacc=qacc,
+        qfrc_constraint=forces.Ma - data.qfrc_smooth,
+        _impl=data._impl.replace(efc_force=forces.efc_force),
+    )
+
+
+def _minimum(
+    law: Callable[[Array], tuple[Array, Context]], hessian: Callable[[Array], Array], start: Array
+) -> Array:
+    """The acceleration (nv,) where the slope of `law` is zero, to rounding, by Newton's method.
+
+    The function is piecewise quadratic where friction cones are pyramids: once the step knows which
+    constraints are active it ends at the minimum. Before, a shorter step may be better.
+    """
+    sizes = 0.5 ** jnp.arange(SIZES)
+
+    def newton(carry: Any) -> Any:
+        count, _, qacc, slope, cost = carry
+        direction = solve(cholesky(hessian(qacc)), slope)
+        tries = qacc - sizes[:, None] * direction
+        slopes, forces = jax.vmap(law)(tries)
+        best = jnp.argmin(forces.cost)
+        rounding = jnp.finfo(cost.dtype).eps * jnp.abs(cost)
+        least = jnp.maximum(rounding, SLIGHT * jnp.dot(slope, direction))
+        better = cost - forces.cost[best] > least
+        found = tries[best], slopes[best], forces.cost[best]
+        kept = jax.tree.map(partial(jnp.where, better), found, (qacc, slope, cost))
+        return count + 1, better, *kept
+
+    slope, forces = law(start)
+    begin = jnp.array(0), jnp.array(True), start, slope, forces.cost
+    end: Any = jax.lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], newton, begin)
+    return end[2]
+
+
+def step(model: mjx.Model, x: Array, u: Array) -> Array:
+    """The state (nx,) one timestep after x (nx,) under the control u (nu,)."""
+    joints, h = Joints.of(model), model.opt.timestep
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return _runge_kutta(model, joints, x, u)
+    data = forward(model, x, u)
+    dv = h * _implicit(model, data)
+    act = mjx.euler(model, data).act if model.na else data.act
+    return joints.integrate(x, jnp.concatenate([h * (data.qvel + dv), dv, act - data.act]))
+
+
+def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
+    """The acceleration (nv,) that treats forces that fall with velocity implicitly."""
+    h = model.opt.timestep
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
+            return data.qacc
+        fall = -jnp.diag(model.dof_damping)
+    else:
+        fall = mjx.deriv_smooth_vel(model, data)
+        if fall is None:
+            return data.qacc
+    M = symmetric(data._impl.M - h * fall)
+    return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
+
+
+def _runge_kutta(model: mjx.Model, joints: Joints, x: Array, u: Array) -> Array:
+    """MuJoCo's Runge-Kutta step of order 4."""
+    h = model.opt.timestep
+
+    def stage(carry: tuple[Array, Array], entry: Array) -> tuple[tuple[Array, Array], None]:
+        rate, total = carry
+        data = forward(model, joints.integrate(x, h * entry[0] * rate), u)
+        rate = jnp.concatenate([data.qvel, data.qacc, data.act_dot])
+        return (rate, total + entry[1] * rate), None
+
+    zero = jnp.zeros(2 * model.nv + model.na, x.dtype)
+    _, total = jax.lax.scan(stage, (zero, zero), jnp.array(RK4, x.dtype))[0]
+    moved = joints.integrate(x, h * total)
+    if model.na == 0:
+        return moved
+    # Activations have rules of their own (exact filters, ranges), which Euler's step knows
+    data = forward(model, x, u).replace(act_dot=total[2 * model.nv :])
+    return moved.at[model.nq + model.nv :].set(mjx.euler(model, data).act)

@@ -1,0 +1,330 @@
+"""Kinematics and smooth dynamics of a tree of bodies, without a walk along the tree.
+
+MJX walks: it repeats the same few operations for every level of the tree and every kind of joint,
+and compilers need time in proportion. (GPUs' need more: they fuse what a level needs into each of
+its readers, again and again.) Here each is written once, for all joints or bodies.
+
+Frames are composed by doubling: each knows its place in an ancestor's; composed with that of the
+ancestor, it knows its place in one twice as far up. After log2(depth) rounds that is the world.
+Velocities, accelerations, forces and inertias add up along the tree. With S[b, d] = 1 where degree
+of freedom d moves body b, and else 0, sums over what is above are products with S, and sums over
+what is below with its transpose.
+
+Products of small matrices are sums of three terms: compilers fuse these, but neither reductions nor
+calls of a library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.physics._mjx import mjx
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.quaternion import matrix, multiply, normalized
+
+_FREE, _BALL, _SLIDE, _HINGE = (
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE")
+)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The frames that are composed: the world's, one after each joint, one of each other body.
+
+    Attributes:
+        parents: the frame that each is in at first, (n,).
+        bodies: whose offset comes first in each, or nbody for none, (n,).
+        joints: whose motion follows, or njnt for none, (n,).
+        last: of each body, (nbody,).
+    """
+
+    parents: np.ndarray
+    bodies: np.ndarray
+    joints: np.ndarray
+    last: np.ndarray
+
+    @classmethod
+    def of(cls, model: mjx.Model) -> _Frames:
+        """Those of a model."""
+        none, still = model.nbody, model.njnt
+        found, last = [(0, none, still)], [0]
+        for body in range(1, model.nbody):
+            frame, offset = last[model.body_parentid[body]], body
+            start, count = model.body_jntadr[body], model.body_jntnum[body]
+            for joint in range(start, start + count) if count else [still]:
+                free = joint < still and model.jnt_type[joint] == _FREE
+                found.append((frame, none if free else offset, joint))
+                frame, offset = len(found) - 1, none
+            last.append(frame)
+        parents, bodies, joints = np.array(found, int).T
+        return cls(parents, bodies, joints, np.array(last, int))
+
+
+def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.kinematics`: `data` with the frames of bodies, joints, geoms and sites."""
+    frames, kinds = _Frames.of(model), np.asarray(model.jnt_type)
+    offset, tilt = model.body_pos, model.body_quat
+    if model.nmocap:
+        mocap = np.flatnonzero(np.asarray(model.body_mocapid) >= 0)
+        which = np.asarray(model.body_mocapid)[mocap]
+        offset = offset.at[mocap].set(data.mocap_pos[which])
+        tilt = tilt.at[mocap].set(normalized(data.mocap_quat[which]))
+    slides, turns = _slides(model, data.qpos), _turns(model, data.qpos)
+    pivots = jnp.where(kinds[:, None] == _FREE, 0.0, model.jnt_pos)
+    move = _padded(slides + pivots - _applied(turns, pivots), 0.0)[frames.joints]
+    turn = _padded(turns, jnp.eye(3))[frames.joints]
+    offsets = _padded(offset, 0.0)[frames.bodies]
+    tilts = _padded(matrix(tilt), jnp.eye(3))[frames.bodies]
+    pos, mat = offsets + _applied(tilts, move), _product(tilts, turn)
+    pos, mat = _composed(pos, mat, frames.parents)
+
+    after = np.array([np.flatnonzero(frames.joints == j)[0] for j in range(model.njnt)], int)
+    axes = model.jnt_axis
+    if (kinds == _BALL).any():  # an axis is that before its joint turns, which only a ball's feels
+        before = _applied(jnp.swapaxes(turns, 1, 2), axes)
+        axes = jnp.where(kinds[:, None] == _BALL, before, axes)
+    xaxis = _applied(mat[after], axes)
+    xaxis = jnp.where(kinds[:, None] == _FREE, jnp.array([0.0, 0.0, 1.0]), xaxis)
+    slid = jnp.where(kinds[:, None] == _SLIDE, slides, 0.0)
+    xpos, xmat = pos[frames.last], mat[frames.last]
+
+    def placed(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
+        """Positions and axes of what is fixed to bodies."""
+        return xpos[body] + _applied(xmat[body], pos), _product(xmat[body], matrix(quat))
+
+    xipos, ximat = placed(np.arange(model.nbody), model.body_ipos, model.body_iquat)
+    geom_xpos, geom_xmat = placed(np.asarray(model.geom_bodyid), model.geom_pos, model.geom_quat)
+    site_xpos, site_xmat = placed(np.asarray(model.site_bodyid), model.site_pos, model.site_quat)
+    return data.replace(
+        qpos=Joints.of(model).normalized(data.qpos),
+        xanchor=pos[after] + _applied(mat[after], pivots - slid),
+        xaxis=xaxis,
+        xpos=xpos,
+        xquat=_quaternions(model, data.qpos, tilt, frames),
+        xmat=xmat,
+        xipos=xipos,
+        ximat=ximat,
+        geom_xpos=geom_xpos,
+        geom_xmat=geom_xmat,
+        site_xpos=site_xpos,
+        site_xmat=site_xmat,
+    )
+
+
+def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.com_pos`: `data` with centres of mass, inertias and motions about them.
+
+    subtree_com (nbody, 3); cinert (nbody, 10) and cdof (nv, 6), about the centre of mass of all
+    that hangs on the same body of the world; motions are turning first, then moving.
+    """
+    inside = _Sums.of(model).subtrees
+    mass = model.body_mass[:, None]
+    below = _summed(inside, mass)
+    whole = jnp.maximum(below, mujoco.mjMINVAL)
+    com = jnp.where(below < mujoco.mjMINVAL, data.xipos, _summed(inside, mass * data.xipos) / whole)
+    about = com[model.body_rootid]
+    away = data.xipos - about
+    inertia = _product(data.ximat * model.body_inertia[:, None], jnp.swapaxes(data.ximat, 1, 2))
+    far = jnp.sum(away * away, axis=1)[:, None, None] * jnp.eye(3)
+    inertia = inertia + mass[:, :, None] * (far - away[:, :, None] * away[:, None])
+    rows, columns = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+    cinert = jnp.concatenate([inertia[:, rows, columns], mass * away, mass], axis=1)
+
+    kinds, joint, body = np.asarray(model.jnt_type), model.dof_jntid, model.dof_bodyid
+    kind, within = kinds[joint], np.arange(model.nv) - np.asarray(model.jnt_dofadr)[joint]
+    moves = (kind == _SLIDE) | ((kind == _FREE) & (within < 3))
+    turns = data.xmat[body, :, within % 3]  # columns of a matrix: the body's own axes
+    axes = jnp.where((kind == _FREE)[:, None] & moves[:, None], jnp.eye(3)[within % 3], turns)
+    axes = jnp.where(np.isin(kind, (_SLIDE, _HINGE))[:, None], data.xaxis[joint], axes)
+    swept = jnp.cross(axes, about[body] - data.xanchor[joint])
+    turning = jnp.where(moves[:, None], 0.0, axes)
+    cdof = jnp.concatenate([turning, jnp.where(moves[:, None], axes, swept)], axis=1)
+    return data.tree_replace({"subtree_com": com, "_impl.cinert": cinert, "cdof": cdof})
+
+
+def mass_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.crb`: `data` with the joint-space inertia M, dense (nv, nv).
+
+    M[i, j] = cdof_j . I_i cdof_i for a degree of freedom j that moves what i moves, with I_i the
+    inertia of all of that.
+    """
+    sums = _Sums.of(model)
+    moved = _inertia_times(_summed(sums.moves.T, data._impl.cinert), data.cdof)
+    products = jnp.sum(moved[:, None] * data.cdof, axis=2)
+    below = jnp.where(np.tril(sums.moves[model.dof_bodyid]) > 0, products, 0.0)
+    M = below + jnp.tril(below, -1).T + jnp.diag(model.dof_armature)
+    return data.tree_replace({"_impl.M": M})
+
+
+def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.com_vel`: `data` with velocities cvel (nbody, 6) and rates of cdof (nv, 6)."""
+    sums = _Sums.of(model)
+    velocity = data.cdof * data.qvel[:, None]
+    above = _summed(np.concatenate([sums.moves, sums.before]), velocity)
+    cvel, before = above[: model.nbody], above[model.nbody :]
+    return data.replace(cvel=cvel, cdof_dot=_crossed(before, data.cdof))
+
+
+def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.rne`: `data` with the forces qfrc_bias (nv,) of gravity and velocities."""
+    moves, inertia = _Sums.of(model).moves, data._impl.cinert
+    acceleration = _summed(moves, data.cdof_dot * data.qvel[:, None])
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        acceleration = acceleration - jnp.concatenate([jnp.zeros(3), model.opt.gravity])
+    momentum = _inertia_times(inertia, data.cvel)
+    force = _inertia_times(inertia, acceleration) + _crossed_force(data.cvel, momentum)
+    return data.replace(qfrc_bias=jnp.sum(data.cdof * _summed(moves.T, force), axis=1))
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Which rows add up, as matrices of zeros and ones.
+
+    Attributes:
+        moves: S, degrees of freedom that move a body, (nbody, nv).
+        before: those that move a degree of freedom's axis, (nv, nv).
+        subtrees: bodies that hang on a body, itself included, (nbody, nbody).
+    """
+
+    moves: np.ndarray
+    before: np.ndarray
+    subtrees: np.ndarray
+
+    @classmethod
+    def of(cls, model: mjx.Model) -> _Sums:
+        """Those of a model."""
+        subtrees = np.eye(model.nbody)
+        for body in reversed(range(1, model.nbody)):
+            subtrees[model.body_parentid[body]] += subtrees[body]
+        moves = subtrees[np.asarray(model.dof_bodyid, int)].T
+        # On the same body, earlier joints count; of a free one its moving, for its turning
+        joint, dof = np.asarray(model.dof_jntid, int), np.arange(model.nv)
+        begins = np.asarray(model.jnt_dofadr, int)[joint]
+        free = np.asarray(model.jnt_type, int)[joint] == _FREE
+        begins = np.where(free, np.where(dof < begins + 3, 0, begins + 3), begins)
+        before = moves[np.asarray(model.dof_bodyid, int)] * (dof < begins[:, None])
+        return cls(moves, before, subtrees)
+
+
+def _summed(which: np.ndarray, rows: Array) -> Array:
+    """Sums (m, k) of those rows (n, k) that each row of `which` (m, n) marks."""
+    return jnp.sum(which[:, :, None].astype(rows.dtype) * rows, axis=1)
+
+
+def _inertia_times(inertia: Array, motion: Array) -> Array:
+    """Momenta (n, 6) of bodies with inertias (n, 10) in motions (n, 6)."""
+    whole = inertia[:, np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
+    off, mass = inertia[:, 6:9], inertia[:, 9:]
+    turning, moving = motion[:, :3], motion[:, 3:]
+    angular = _applied(whole, turning) + jnp.cross(off, moving)
+    return jnp.concatenate([angular, mass * moving - jnp.cross(off, turning)], axis=1)
+
+
+def _crossed(v: Array, motion: Array) -> Array:
+    """Rates (n, 6) of motions (n, 6) that velocities (n, 6) carry along."""
+    (turn, move), (turning, moving) = (jnp.split(a, 2, axis=1) for a in (v, motion))
+    along = jnp.cross(move, turning) + jnp.cross(turn, moving)
+    return jnp.concatenate([jnp.cross(turn, turning), along], axis=1)
+
+
+def _crossed_force(v: Array, force: Array) -> Array:
+    """Rates (n, 6) of forces or momenta (n, 6) that velocities (n, 6) carry along."""
+    (turn, move), (twist, push) = (jnp.split(a, 2, axis=1) for a in (v, force))
+    around = jnp.cross(turn, twist) + jnp.cross(move, push)
+    return jnp.concatenate([around, jnp.cross(turn, push)], axis=1)
+
+
+def _of_kind(model: mjx.Model, *kinds: int) -> tuple[np.ndarray, np.ndarray]:
+    """The joints of some kinds, and where they begin in qpos, (n,) each."""
+    joints = np.flatnonzero(np.isin(model.jnt_type, kinds))
+    return joints, np.asarray(model.jnt_qposadr)[joints]
+
+
+def _slides(model: mjx.Model, qpos: Array) -> Array:
+    """How far each joint has slid along its axis, a free one in the world, (njnt, 3)."""
+    (free, begins), (slide, at) = _of_kind(model, _FREE), _of_kind(model, _SLIDE)
+    slid = model.jnt_axis[slide] * (qpos - model.qpos0)[at, None]
+    still, _ = _of_kind(model, _BALL, _HINGE)
+    floated = qpos[begins[:, None] + np.arange(3)]
+    return _sorted([(free, floated), (slide, slid), (still, jnp.zeros((len(still), 3)))])
+
+
+def _turns(model: mjx.Model, qpos: Array) -> Array:
+    """How each joint has turned, a free one in the world, (njnt, 3, 3)."""
+    hinge, at = _of_kind(model, _HINGE)
+    angle, axis = (qpos - model.qpos0)[at, None, None], model.jnt_axis[hinge, None]
+    along = axis * jnp.swapaxes(axis, 1, 2)
+    across, skew = jnp.eye(3) - along, jnp.cross(jnp.eye(3), axis)
+    spun = along + jnp.cos(angle) * across + jnp.sin(angle) * skew
+    return _merged(model, qpos, matrix, jnp.eye(3), spun)
+
+
+def _quaternions(model: mjx.Model, qpos: Array, tilt: Array, frames: _Frames) -> Array:
+    """Of the bodies in the world, (nbody, 4); MJX itself reads hardly any."""
+    identity = jnp.array([1.0, 0.0, 0.0, 0.0])
+    hinge, at = _of_kind(model, _HINGE)
+    half = 0.5 * (qpos - model.qpos0)[at, None]
+    spun = jnp.concatenate([jnp.cos(half), jnp.sin(half) * model.jnt_axis[hinge]], axis=1)
+    turns = _merged(model, qpos, lambda quat: quat, identity, spun)
+    quat = _padded(tilt, identity)[frames.bodies]
+    quat, parents = multiply(quat, _padded(turns, identity)[frames.joints]), frames.parents
+    while parents.any():
+        quat, parents = multiply(quat[parents], quat), parents[parents]
+    return quat[frames.last]
+
+
+def _merged(
+    model: mjx.Model,
+    qpos: Array,
+    of_quaternion: Callable[[Array], Array],
+    identity: Array,
+    of_hinges: Array,
+) -> Array:
+    """Rotations (njnt, ...) of all joints, from those of hinges and of quaternions in qpos."""
+    (free, begins), (ball, at) = _of_kind(model, _FREE), _of_kind(model, _BALL)
+    (slide, _), (hinge, _) = _of_kind(model, _SLIDE), _of_kind(model, _HINGE)
+    at = np.concatenate([begins + 3, at])[:, None] + np.arange(4)
+    turning = of_quaternion(normalized(qpos[at]))
+    still = jnp.broadcast_to(identity, (len(slide), *identity.shape))
+    return _sorted([(np.concatenate([free, ball]), turning), (slide, still), (hinge, of_hinges)])
+
+
+def _sorted(parts: Sequence[tuple[np.ndarray, Array]]) -> Array:
+    """Rows of several parts, each with the places (n,) of its rows, at these places."""
+    order = np.argsort(np.concatenate([places for places, _ in parts]))
+    rows = [rows for places, rows in parts if len(places)] or [parts[0][1]]
+    joined = jnp.concatenate(rows) if len(rows) > 1 else rows[0]
+    return joined if (order == np.arange(len(order))).all() else joined[order]
+
+
+def _padded(rows: Array, last: ArrayLike) -> Array:
+    """The rows, and one more."""
+    return jnp.concatenate([rows, jnp.broadcast_to(last, (1, *rows.shape[1:])).astype(rows.dtype)])
+
+
+def _composed(pos: Array, mat: Array, parents: np.ndarray) -> tuple[Array, Array]:
+    """Frames (n, 3) and (n, 3, 3) in the world, from those in their parents (n,)."""
+    while parents.any():
+        above = mat[parents]
+        pos, mat = pos[parents] + _applied(above, pos), _product(above, mat)
+        parents = parents[parents]
+    return pos, mat
+
+
+def _applied(A: Array, v: Array) -> Array:
+    """A v for matrices (n, 3, 3) and vectors (n, 3)."""
+    x, y, z = (A[:, :, k] * v[:, k, None] for k in range(3))
+    return x + y + z
+
+
+def _product(A: Array, B: Array) -> Array:
+    """A B for matrices (n, 3, 3)."""
+    x, y, z = (A[:, :, k, None] * B[:, None, k] for k in range(3))
+    return x + y + z

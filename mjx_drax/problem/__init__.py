@@ -1,0 +1,1 @@
+"""What is solved: trajectories, bounds, costs, dynamics, and how they are built and checked."""

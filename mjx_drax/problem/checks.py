@@ -1,0 +1,204 @@
+"""What is asked of the functions that users give, found by tracing them: nothing is compiled.
+
+A cost is called with arrays that have shapes and no values. That shows what it returns, and what it
+computes: its jaxpr. If two traces differ, the function reads something besides its arguments that
+changes (a counter, random numbers, the time). If its value depends on its arguments and the tangent
+of its value does not, its derivative is zero everywhere, and no solver can follow it.
+
+A function that reads a global which changes later cannot be told from one that reads a constant:
+what was read when it was traced stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.interpreters.partial_eval import dce_jaxpr
+
+from mjx_drax.base.errors import DraxError, reason, shown
+
+Arguments = tuple[Any, ...]
+
+
+def require_functions(**given: Any) -> None:
+    """Complain about what is neither a function nor None.
+
+    Raises:
+        DraxError: naming it, its value and the fix.
+    """
+    for label, function in given.items():
+        if function is not None and (not callable(function) or isinstance(function, type)):
+            raise DraxError(f"{label} is {shown(function)}: give a function, or leave it out.")
+
+
+def require_shape(
+    label: str, function: Callable[..., Any], arguments: Arguments, shape: tuple[int, ...] | None
+) -> None:
+    """Trace a function abstractly; complain if it fails or returns another shape.
+
+    Raises:
+        DraxError: naming the cause, what was returned and the fix.
+    """
+    seen = traced(label, function, arguments).shape
+    if shape is not None and seen != shape:
+        expected = "a scalar" if shape == () else f"shape {shape}"
+        hint = " (a vector cost goes in as a residual)" if shape == () else ""
+        raise DraxError(f"{label} returned shape {seen}, but must return {expected}{hint}.")
+
+
+def traced(label: str, function: Callable[..., Any], arguments: Arguments) -> jax.ShapeDtypeStruct:
+    """Shape and dtype of what a function returns, which must be one array of floats.
+
+    Raises:
+        DraxError: it fails, returns something else, or something else each time.
+    """
+
+    def one_array(*values: Any) -> Any:
+        out = function(*values)
+        dtype = getattr(out, "dtype", None) if hasattr(out, "shape") else np.result_type(float)
+        if dtype is None or not (hasattr(out, "shape") or isinstance(out, float)):
+            raise DraxError(f"{label} returned {_described(out)}: return one array of floats.")
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise DraxError(
+                f"{label} returned an array of {dtype}: it must return one array of floats; "
+                "use numbers with a point, or astype(float)."
+            )
+        return out
+
+    first, second = (_jaxpr(label, one_array, arguments) for _ in range(2))
+    if _fingerprint(first) != _fingerprint(second):
+        raise DraxError(
+            f"{label} computed something else when it was called again: it depends on a global, on "
+            "random numbers or on the time. Make it a function of its arguments alone."
+        )
+    return first.out_avals[0]
+
+
+def _jaxpr(label: str, function: Callable[..., Any], arguments: Arguments) -> ClosedJaxpr:
+    try:
+        return jax.make_jaxpr(lambda *values: function(*values))(*arguments)  # a new one: no cache
+    except DraxError:
+        raise
+    except Exception as error:
+        raise DraxError(
+            f"{label} failed when it was traced: {plain(error)}. Make it a JAX function of its "
+            f"{len(arguments)} argument{'s' * (len(arguments) > 1)}: jax.numpy, and no Python "
+            "branches on values."
+        ) from error
+
+
+def plain(error: Exception) -> str:
+    """The reason, for the commonest errors without the terms of JAX."""
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return "`if`, `while`, `and`, `or` or `not` on a value; use jnp.where"
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return "a numpy function got a traced value; use the one of jax.numpy"
+    if isinstance(error, jax.errors.UnexpectedTracerError):
+        return "it kept a traced value in a global and used it again; remove that"
+    if isinstance(error, jax.errors.ConcretizationTypeError):
+        return "float(), int() or a shape made of a value; use jax.numpy on arrays"
+    return reason(error).replace("jax.", "").replace("Tracer", "traced value")
+
+
+def _described(out: Any) -> str:
+    """What a function returned, without what JAX writes about traced values."""
+    if hasattr(out, "shape"):
+        return f"an array of {out.dtype}"
+    if isinstance(out, bool | int | complex | str | bytes | type(None)):
+        return shown(out)
+    return f"a {type(out).__name__}"
+
+
+def _fingerprint(closed: ClosedJaxpr) -> list[Any]:
+    """What a jaxpr computes, so that two of the same function are equal."""
+    return [*map(_bytes, closed.consts), *_operations(closed.jaxpr)]
+
+
+def _operations(jaxpr: Jaxpr) -> Iterator[Any]:
+    for equation in jaxpr.eqns:
+        known = [_bytes(v.val) for v in equation.invars if isinstance(v, Literal)]
+        yield str(equation.primitive), known, [str(v.aval) for v in equation.outvars]
+        for inner in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda p: isinstance(p, ClosedJaxpr | Jaxpr)
+        ):
+            if isinstance(inner, ClosedJaxpr):
+                yield from _fingerprint(inner)
+            elif isinstance(inner, Jaxpr):
+                yield from _operations(inner)
+    yield [_bytes(v.val) for v in jaxpr.outvars if isinstance(v, Literal)]
+
+
+def _bytes(value: Any) -> Any:
+    return None if isinstance(value, jax.core.Tracer) else np.asarray(value).tobytes()
+
+
+def require_derivatives(
+    label: str,
+    function: Callable[..., Any],
+    arguments: Arguments,
+    forward: bool = True,
+    twice: bool = False,
+    reverse: bool = False,
+) -> None:
+    """Complain about a function that has no derivatives, or none but zeros.
+
+    Args:
+        label: of the function.
+        function: of pytrees of arrays, which `traced` accepts.
+        arguments: their shapes and dtypes.
+        forward: whether it is differentiated in forward mode,
+        twice: and twice so;
+        reverse: whether in reverse mode.
+
+    Raises:
+        DraxError: naming the function and the fix.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    moves = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+    values, fixed = (
+        [a for a, m in zip(leaves, moves, strict=True) if m is k] for k in (True, False)
+    )
+
+    def slopes(values: list[Any], fixed: list[Any], tangents: list[Any]) -> tuple[Any, Any]:
+        """The value, and its change along tangents; other modes are tried besides."""
+
+        def of_values(*values: Any) -> Any:
+            parts = {True: iter(values), False: iter(fixed)}
+            return function(*jax.tree.unflatten(tree, [next(parts[m]) for m in moves]))
+
+        def change(*values: Any) -> Any:
+            return jax.jvp(of_values, values, tuple(tangents))[1]
+
+        if twice:
+            jax.jvp(change, tuple(values), tuple(tangents))
+        if reverse:
+            value, back = jax.vjp(of_values, *values)
+            slope = back(jnp.ones_like(value))
+        if forward:
+            return of_values(*values), change(*values)
+        return value, [g * t for g, t in zip(slope, tangents, strict=True)]
+
+    try:
+        jaxpr = jax.make_jaxpr(slopes)(values, fixed, values).jaxpr
+    except Exception as error:
+        words = plain(error)
+        if "custom_vjp" in str(error) or "custom_lin" in str(error):
+            words = "it has a custom_vjp, which serves reverse mode only; make that a custom_jvp"
+        raise DraxError(
+            f"{label} cannot be differentiated: {words}. Use operations that have derivatives, or "
+            "sample it: preconditioner=GaussNewton(derivatives=Smoothed())."
+        ) from error
+    outputs = [i == 0 for i in range(len(jaxpr.outvars))]
+    read = dce_jaxpr(jaxpr, outputs)[1][: len(values)]
+    followed = dce_jaxpr(jaxpr, [not o for o in outputs])[1][len(leaves) :]
+    if any(read) and not any(followed):
+        raise DraxError(
+            f"the derivative of {label} is zero everywhere, so nothing can be improved by it: it "
+            "rounds, compares or counts. Make it smooth, or sample it: "
+            "preconditioner=GaussNewton(derivatives=Smoothed())."
+        )

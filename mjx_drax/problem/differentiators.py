@@ -1,0 +1,116 @@
+"""Derivatives of functions of one knot, exact or from samples.
+
+A *differentiator* turns a function of a displacement dz of one knot into its Jacobian. Dynamics,
+residuals, costs and constraints all go through it, so with `Smoothed` the whole solver runs on
+function values alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.kernels.linalg import symmetric
+from mjx_drax.kernels.scalarize import pruned, scalarized
+
+Function = Callable[[Array], Array]
+
+
+class Differentiator(Protocol):
+    """Derivatives at dz = 0 of functions of a displacement dz (n,)."""
+
+    def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
+        """Jacobian (m, n) of a function dz (n,) -> (m,), and the function's value (m,)."""
+        ...
+
+    def hessian(self, function: Function, size: int) -> Array:
+        """A model (n, n) of the Hessian of a function dz (n,) -> scalar."""
+        ...
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Autodiff:
+    """Exact derivatives by forward-mode differentiation.
+
+    Forward mode passes through the solver loops of MJX, which reverse mode does not.
+    """
+
+    def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
+        """Jacobian (m, n) and value (m,), one tangent for each of the n directions."""
+        lean = pruned(function)
+
+        def with_value(dz: Array) -> tuple[Array, Array]:
+            value = lean(dz)
+            return value, value
+
+        return jax.jacfwd(with_value, has_aux=True)(jnp.zeros(size))
+
+    def hessian(self, function: Function, size: int) -> Array:
+        """Hessian (n, n)."""
+        return jax.jacfwd(jax.jacfwd(pruned(function)))(jnp.zeros(size))
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class InScalars:
+    """The derivatives of another differentiator, in scalar arithmetic where that is possible.
+
+    Of the tangents of a mechanism most entries are zero, and cost nothing then; see `scalar`.
+    """
+
+    by: Differentiator
+
+    def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
+        """Jacobian (m, n) and value (m,)."""
+        return scalarized(lambda: self.by.jacobian(function, size, key), outermost=True)()
+
+    def hessian(self, function: Function, size: int) -> Array:
+        """Hessian (n, n)."""
+        return scalarized(lambda: self.by.hessian(function, size), outermost=True)()
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Smoothed:
+    """Derivatives of the function smoothed by Gaussian noise, from function values only.
+
+    With perturbations delta_i ~ N(0, radius^2 I) of one knot, in antithetic pairs, the Jacobian is
+    the least-squares fit of  f(delta_i) - f(-delta_i) = 2 J delta_i  (a ridge of 1e-6 keeps it
+    unique with fewer pairs than unknowns). Perturbing one knot at a time needs far fewer samples
+    than perturbing the whole trajectory. Works for functions with jumps and kinks; a scalar cost
+    contributes its gradient and no curvature, so prefer residuals.
+
+    Attributes:
+        pairs: antithetic pairs a knot; at least ndx + nu for a full-rank fit.
+        radius: standard deviation of the perturbations, in the units of the state and control.
+    """
+
+    pairs: int = field(default=16, metadata=Static)
+    radius: ArrayLike = 1e-2
+
+    def jacobian(self, function: Function, size: int, key: Array) -> tuple[Array, Array]:
+        """Jacobian (m, n) of the smoothed function, and the value (m,) of the function itself."""
+        radius = jnp.asarray(self.radius)
+        delta = jax.random.normal(key, (self.pairs, size))
+        ahead, behind = (jax.vmap(function)(sign * radius * delta) for sign in (1.0, -1.0))
+        slopes = (ahead - behind) / (2.0 * radius)
+        normal = delta.T @ delta + 1e-6 * jnp.eye(size)
+        return jnp.linalg.solve(normal, delta.T @ slopes).T, function(jnp.zeros(size))
+
+    def hessian(self, function: Function, size: int) -> Array:
+        """Zero: curvature from so few samples would be noise."""
+        return jnp.zeros((size, size))
+
+
+def positive_part(matrix: Array) -> Array:
+    """The nearest positive semidefinite matrix (n, n) in the Frobenius norm to a symmetric one."""
+    values, vectors = jnp.linalg.eigh(symmetric(matrix))
+    return (vectors * jnp.maximum(values, 0.0)) @ vectors.T

@@ -1,0 +1,299 @@
+"""Solutions from the files that `results.save` wrote.
+
+A solution that is loaded without its problem gets a stand-in: with the sizes, times, bounds and,
+for MJCF, the model of what was solved. Whatever needs a function of the problem raises a DraxError.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from mjx_drax.base.errors import (
+    DraxError,
+    DraxWarning,
+    reason,
+    require_positive,
+    require_whole,
+    shown,
+)
+from mjx_drax.base.files import file_path
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.method.metrics import Multipliers
+from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.mjcf import HostModel, MjxDynamics, bounded_joints
+from mjx_drax.physics.mjx_model import twin
+from mjx_drax.physics.source import Source, from_binary
+from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
+from mjx_drax.problem.problem import Aside, Box, Constraint, Cost, Problem, Stagewise, Trajectory
+from mjx_drax.search.restarts import Restarts
+from mjx_drax.search.settings import from_data
+from mjx_drax.solution.save import ARRAYS, FORMAT, SUMMARY, json_digest
+from mjx_drax.solution.solution import Replays, Solution
+
+Arrays = dict[str, np.ndarray]
+
+
+def load(folder: str | os.PathLike[str], problem: Problem | None = None) -> Solution:
+    """The solution in a folder; see `Solution.load`."""
+    path = file_path(folder)
+    summary, arrays = _read(path)
+    try:
+        if problem is None:
+            problem = _stand_in(summary, arrays)
+        else:
+            _require_same(problem, summary, arrays)
+        solution = _solution(problem, summary, arrays)
+        _require_consistent(solution, summary)
+        return solution
+    except DraxError:
+        raise
+    except Exception as error:  # what damaged data run into is beyond counting
+        raise DraxError(f"{shown(str(path))} is damaged: {reason(error)}. Solve again.") from error
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
+    """What the two files hold, if they belong together."""
+    contents = []
+    for name in (SUMMARY, ARRAYS):
+        try:
+            contents.append((folder / name).read_bytes())
+        except OSError as error:
+            raise DraxError(
+                f"cannot read {str(folder / name)!r}: {error.strerror or error}. Give a folder "
+                "that Solution.save or `mjx-drax solve` has written."
+            ) from error
+    try:
+        summary = json.loads(contents[0])
+        written = summary.get("format")
+    except (ValueError, AttributeError, RecursionError) as error:
+        raise DraxError(
+            f"{str(folder / SUMMARY)!r} is damaged, it is no JSON object: {reason(error)}. Solve "
+            "again."
+        ) from error
+    if written != FORMAT:
+        which = "no format number" if written is None else f"format {written}"
+        versions = summary.get("versions")
+        version = versions.get("mjx-drax") if isinstance(versions, dict) else "an unknown one"
+        raise DraxError(
+            f"{str(folder / SUMMARY)!r} has {which} (mjx_drax {version} wrote it), and this "
+            f"version reads format {FORMAT}: solve again, or use the version that wrote it."
+        )
+    if summary.get("json_sha256", json_digest(summary)) != json_digest(summary):
+        raise DraxError(
+            f"{str(folder / SUMMARY)!r} is damaged, or was changed after it had been written: undo "
+            "that, remove its json_sha256, or solve again."
+        )
+    if hashlib.sha256(contents[1]).hexdigest() != summary.get("npz_sha256"):
+        raise DraxError(
+            f"{str(folder / ARRAYS)!r} does not belong to {SUMMARY} beside it: it is damaged, or "
+            "saving was interrupted. Solve again."
+        )
+    try:
+        with np.load(io.BytesIO(contents[1]), allow_pickle=False) as arrays:
+            return summary, dict(arrays)
+    except Exception as error:
+        raise DraxError(
+            f"{str(folder / ARRAYS)!r} is damaged: {reason(error)}. Solve again."
+        ) from error
+
+
+def _solution(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> Solution:
+    multipliers = Multipliers(
+        arrays["solution.multipliers.dynamics"],  # type: ignore[arg-type]
+        _stagewise("solution.multipliers.constraints", arrays),
+        (
+            (
+                _trajectory("solution.multipliers.bounds.0", arrays),
+                _trajectory("solution.multipliers.bounds.1", arrays),
+            )
+            if "solution.multipliers.bounds.0.x" in arrays
+            else None
+        ),
+    )
+    history = {k.removeprefix("history_"): v for k, v in arrays.items() if k.startswith("history_")}
+    return Solution(
+        problem=problem,
+        solver=from_data(summary["settings"]),
+        seed=summary["seed"],
+        trajectories=_trajectory("solution.trajectories", arrays),
+        multipliers=multipliers,
+        gains=arrays["solution.gains"],
+        cost=arrays["chain_cost"],
+        max_defect=arrays["chain_max_defect"],
+        max_violation=arrays["chain_max_violation"],
+        converged_at=arrays["chain_converged_at"],
+        died_at=arrays["chain_died_at"],
+        open_loop=Replays(**_within("solution.open_loop.", arrays)),
+        feedback=Replays(**_within("solution.feedback.", arrays)),
+        history=history,
+        iterations=summary["iterations"],
+        compile_time=summary["compile_time_s"],
+        solve_time=summary["solve_time_s"],
+        engine=summary["certificate"]["engine"],
+    )
+
+
+def _require_consistent(solution: Solution, summary: dict[str, Any]) -> None:
+    """Complain about arrays that do not fit each other, and numbers of the wrong kind.
+
+    Raises:
+        DraxError: naming the first that does not fit.
+    """
+    x, u = solution.trajectories.x, solution.trajectories.u
+    dynamics = solution.problem.dynamics
+    chains, K, nx, nu = *x.shape, u.shape[-1]
+    shapes: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "x": (x, (chains, solution.problem.horizon, dynamics.nx)),
+        "u": (u, (chains, K, dynamics.nu)),
+        "gains": (solution.gains, (chains, K, nu, dynamics.ndx)),
+        "multipliers": (solution.multipliers.dynamics, (chains, K, dynamics.ndx)),
+    }
+    for name in ("cost", "max_defect", "max_violation", "converged_at", "died_at"):
+        shapes[name] = getattr(solution, name), (chains,)
+    for mode in ("open_loop", "feedback"):
+        replays = getattr(solution, mode)
+        shapes[f"{mode}.states"] = replays.states, (chains, K + 1, nx)
+        shapes[f"{mode}.controls"] = replays.controls, (chains, K, nu)
+        for name in ("max_deviation", "final_deviation", "max_violation", "cost", "success"):
+            shapes[f"{mode}.{name}"] = getattr(replays, name), (chains,)
+    for name, (array, shape) in shapes.items():
+        if array.shape != shape or array.dtype.kind not in "biuf":
+            raise DraxError(
+                f"the saved solution is damaged: {name} is {array.dtype} of shape {array.shape}, "
+                f"not numbers of shape {shape}. Solve again."
+            )
+    require_whole("horizon of the saved solution", summary["horizon"])
+    require_whole("seed of the saved solution", solution.seed, 0)
+    require_positive("dt of the saved solution", float(dynamics.dt))
+    if not isinstance(solution.solver, Langevin | Restarts):
+        raise DraxError(
+            f"the saved solution is damaged: its solver is {shown(solution.solver)}. Solve again."
+        )
+
+
+def _within(prefix: str, arrays: Arrays) -> Arrays:
+    """The arrays whose names begin so, without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _stagewise(label: str, arrays: Arrays) -> Any:
+    return Stagewise(arrays[f"{label}.stage"], arrays[f"{label}.terminal"])  # type: ignore[arg-type]
+
+
+def _trajectory(label: str, arrays: Arrays) -> Trajectory:
+    slack = _stagewise(f"{label}.slack", arrays) if f"{label}.slack.stage" in arrays else None
+    return Trajectory(arrays[f"{label}.x"], arrays[f"{label}.u"], slack)  # type: ignore[arg-type]
+
+
+def _box(label: str, arrays: Arrays) -> Box:
+    return Box(**{k: jnp.asarray(v) for k, v in _within(f"{label}.", arrays).items()})
+
+
+# The problem
+
+
+def _missing(what: str) -> Partial:
+    """A function that was not saved."""
+
+    def function(*_: Any) -> Any:
+        raise DraxError(
+            f"{what} is code, which is not saved: load the solution with its problem, "
+            "Solution.load(folder, problem)."
+        )
+
+    return Partial(function)
+
+
+def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
+    """The problem as far as it was saved."""
+    x_init = jnp.asarray(arrays["problem.x_init"])
+    stage, terminal = (
+        arrays[f"solution.multipliers.constraints.{part}"].shape[-1]
+        for part in ("stage", "terminal")
+    )
+    cost = Cost(_missing("the cost"), None)
+    return Problem(
+        dynamics=_dynamics(summary, arrays),
+        running=cost,
+        terminal=cost,
+        constraint=_constraint(stage),
+        terminal_constraint=_constraint(terminal),
+        x_init=x_init,
+        bounds=_box("problem.bounds", arrays),
+        scatter=_box("problem.scatter", arrays),
+        aside=Aside(_missing("the goal") if summary["has_goal"] else None, None, summary["task"]),
+        horizon=summary["horizon"],
+    )
+
+
+def _constraint(rows: int) -> Constraint:
+    return Constraint(_missing("the constraint") if rows else None, None, rows, 0)
+
+
+def _dynamics(summary: dict[str, Any], arrays: Arrays) -> Dynamics:
+    dt = summary["dt"]
+    if "model.binary" not in arrays:
+        nx, nu = (arrays[f"solution.trajectories.{z}"].shape[-1] for z in "xu")
+        return FunctionDynamics(_missing("f"), dt, nx, nu)
+    host = _model(summary, arrays)
+    bounded = bounded_joints(host.model, np.asarray(arrays["problem.x_init"], float))
+    substeps = round(dt / host.model.opt.timestep)
+    return MjxDynamics(twin(host.model, summary["contacts"], bounded), dt, host, substeps)
+
+
+def _model(summary: dict[str, Any], arrays: Arrays) -> HostModel:
+    """The compiled model, from its MJCF if another version of MuJoCo compiled it."""
+    source, written = None, summary["versions"]["mujoco"]
+    if "model.xml" in arrays:
+        files = {k: v.tobytes() for k, v in _within("model.files/", arrays).items()}
+        source = Source(str(arrays["model.xml"]), files)
+    if written == mujoco.__version__:
+        return HostModel(from_binary(arrays["model.binary"].tobytes()), source)
+    if source is None:
+        raise DraxError(
+            f"the model was saved by MuJoCo {written} without MJCF, which MuJoCo "
+            f"{mujoco.__version__} cannot read: pip install mujoco=={written}, or load the "
+            "solution with its problem, Solution.load(folder, problem)."
+        )
+    warnings.warn(
+        f"the model was saved by MuJoCo {written} and is compiled anew by {mujoco.__version__}, "
+        "from MJCF with six digits: it may move a little differently.",
+        DraxWarning,
+        stacklevel=4,
+    )
+    return HostModel(source.compiled(), source)
+
+
+def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> None:
+    """Complain if the problem cannot be the one that was solved."""
+    if not isinstance(problem, Problem):
+        raise DraxError(f"the problem is {shown(problem)}: give the one that was solved.")
+    x, u = arrays["solution.trajectories.x"], arrays["solution.trajectories.u"]
+    dynamics = problem.dynamics
+    for label, given, saved in (
+        ("K", problem.horizon, x.shape[1]),
+        ("nx", dynamics.nx, x.shape[2]),
+        ("nu", dynamics.nu, u.shape[2]),
+        ("dt", float(dynamics.dt), summary["dt"]),
+    ):
+        if given != saved:
+            raise DraxError(
+                f"the problem {problem.name} has {label} = {given}, the saved solution of "
+                f"{summary['task']} has {saved}: give the problem that was solved."
+            )
+    if not np.array_equal(np.asarray(problem.x_init), arrays["problem.x_init"]):
+        raise DraxError(
+            f"x_init of the problem {problem.name} is {np.asarray(problem.x_init).tolist()}, the "
+            f"saved solution of {summary['task']} starts at {arrays['problem.x_init'].tolist()}: "
+            "give the problem that was solved."
+        )

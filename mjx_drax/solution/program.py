@@ -1,0 +1,151 @@
+"""Nonlinear programs that are not trajectories, by the same flow.
+
+    min c(x)   s.t.   h(x) = 0,   g(x) <= 0,   x_lower <= x <= x_upper
+
+is an optimal control problem with one knot and no state: x is its control, h and g are its stage
+constraints. Everything else (the metrics, bounds, schedules, chains) is shared with trajectories.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from mjx_drax.base.errors import DraxError, require_whole, shown
+from mjx_drax.method.langevin import FEASIBLE, Langevin
+from mjx_drax.problem.checks import require_functions
+from mjx_drax.problem.problem import Problem, Trajectory, checked, from_function, numbers
+from mjx_drax.search.restarts import Progress, Restarts, run
+
+
+def from_program(
+    size: int,
+    *,
+    cost: Callable[[Array], Array] | None = None,
+    residual: Callable[[Array], Array] | None = None,
+    equality: Callable[[Array], Array] | None = None,
+    inequality: Callable[[Array], Array] | None = None,
+    bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    name: str = "program",
+) -> Problem:
+    """A nonlinear program in x (size,), as a problem that `run` and `minimize` solve.
+
+    Args:
+        size: n, number of variables.
+        cost: c(x), a scalar.
+        residual: r(x) (m,): adds 1/2 |r|^2 to the cost.
+        equality: h(x) (m,), held at 0.
+        inequality: g(x) (m,), held <= 0 through slack variables g + s = 0, s >= 0.
+        bounds: (lower, upper), scalars or (n,).
+        scatter: box that initial points are drawn from; by default the bounds, or +-1.
+        name: used in messages.
+
+    Raises:
+        DraxError: functions, sizes or bounds that do not fit.
+    """
+    require_functions(cost=cost, residual=residual, equality=equality, inequality=inequality)
+    require_whole("size", size)
+
+    def of_control(function: Callable[[Array], Array] | None) -> Callable[..., Any] | None:
+        return None if function is None else lambda x, u: function(u)
+
+    return from_function(
+        lambda x, u: x,
+        x_init=np.zeros(0),
+        nu=size,
+        dt=1.0,
+        horizon=1.0,
+        running_cost=of_control(cost),
+        running_residual=of_control(residual),
+        equality=of_control(equality),
+        inequality=of_control(inequality),
+        u_bounds=bounds,
+        u_scatter=scatter,
+        name=name,
+    )
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Where the chains of a nonlinear program ended. Arrays are numpy's.
+
+    Attributes:
+        x: (chains, n).
+        equality: multipliers of h, (chains, m).
+        inequality: multipliers of g, (chains, mg).
+        cost: c(x), (chains,).
+        max_defect: largest |h| or positive g, (chains,).
+        died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
+    """
+
+    x: np.ndarray
+    equality: np.ndarray
+    inequality: np.ndarray
+    cost: np.ndarray
+    max_defect: np.ndarray
+    died_at: np.ndarray
+
+    @cached_property
+    def best_chain(self) -> int:
+        """The cheapest feasible chain, else the least infeasible one."""
+        feasible = (self.max_defect < FEASIBLE) & (self.died_at < 0)
+        if feasible.any():
+            return int(np.argmin(np.where(feasible, self.cost, np.inf)))
+        return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
+
+    @property
+    def best(self) -> np.ndarray:
+        """x of the best chain, (n,)."""
+        return self.x[self.best_chain]
+
+
+def minimize(
+    program: Problem,
+    chains: int = 64,
+    seed: int = 0,
+    solver: Langevin | Restarts | None = None,
+    guess: ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> Minimum:
+    """Solve a program from `from_program`; `guess` (n,) or (chains, n) replaces random points.
+
+    Raises:
+        DraxError: sizes that misfit; functions that cannot be differentiated, or are finite, with
+            their derivatives, at no initial point.
+    """
+    program = checked(program)
+    if program.dynamics.nx or program.horizon != 1:
+        raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
+    knots = None
+    if guess is not None:
+        size = program.dynamics.nu
+        try:
+            given = numbers(guess)
+        except (TypeError, ValueError) as error:
+            raise DraxError(f"guess is {shown(guess)}: give numbers, ({size},).") from error
+        if given.shape not in ((size,), (chains, size)):
+            raise DraxError(
+                f"guess has shape {given.shape}: give ({size},), or ({chains}, {size}) with one "
+                "for each chain."
+            )
+        u = jnp.asarray(given)[..., None, :]
+        knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
+    result = run(program, chains, seed, Restarts() if solver is None else solver, knots, progress)
+    info, rows = result.info, program.constraint.equalities
+    multipliers = np.asarray(result.state.multipliers.constraints.stage[:, 0])
+    return Minimum(
+        x=np.asarray(result.state.trajectory.u[:, 0]),
+        equality=multipliers[:, :rows],
+        inequality=multipliers[:, rows:],
+        cost=np.asarray(info.cost),
+        max_defect=np.asarray(info.max_defect),
+        died_at=np.asarray(result.state.died_at),
+    )

@@ -1,0 +1,1 @@
+"""Benchmarks, comparisons with other methods, and the figures of the paper."""

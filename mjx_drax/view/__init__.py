@@ -1,0 +1,1 @@
+"""Pictures and videos of solutions. Nothing here solves."""

@@ -1,0 +1,440 @@
+"""One picture of a solution: the motion, how the chains got there, and where they ended.
+
+Colors are those of Okabe and Ito, which colour-blind readers tell apart; markers and dashes say the
+same without colour. Figures are drawn by matplotlib's Agg objects: no display, no global state.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+
+from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import complete, file_path
+from mjx_drax.method.langevin import FEASIBLE
+from mjx_drax.physics.states import finite
+from mjx_drax.solution.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from mjx_drax.problem.dynamics import Dynamics
+    from mjx_drax.solution.optima import Optimum
+
+    Draw = Callable[[Axes, np.ndarray], None]
+
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, VERMILLION, PURPLE, GRAY = "#0072B2", "#D55E00", "#CC79A7", "#767676"
+CURVES = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY)
+
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
+
+DPI = 150
+COLUMNS = 2
+MAPS, PANELS = 9, 12
+"""Most panels of `plot_optima`: optima on maps, coordinates of states."""
+
+
+def plot_solution(
+    solution: Solution, path: str | os.PathLike[str], draw: Draw | None = None
+) -> Path:
+    """Draws a solution as a PNG, and returns its path.
+
+    Panels: the best chain's states and controls, planned (dashed) and as replayed (solid); max|h|
+    of all chains and the cost of the feasible ones over the iterations; every chain's final cost.
+
+    Args:
+        solution: from `solve`.
+        path: where to, ending in .png; its folder is made if need be.
+        draw: draw(axes, states (K + 1, nx)), for one more panel; tasks may have one.
+
+    Raises:
+        DraxError: the path cannot be written.
+    """
+    panels: list[Callable[[Axes], None]] = []
+    if draw is not None:
+        panels.append(partial(_draw_scene, solution=solution, draw=draw))
+    times, mode = solution.problem.times, solution.replay_mode
+    panels += [partial(curves.draw, times=times, mode=mode) for curves in _motion(solution)]
+    panels += [
+        partial(_draw_defects, solution=solution),
+        partial(_draw_costs, solution=solution),
+        partial(_draw_chains, solution=solution),
+    ]
+    rows = -(-len(panels) // COLUMNS)
+    figure = Figure((4.0 * COLUMNS, 2.6 * rows + 0.8), DPI, layout="constrained", facecolor="white")
+    grid = figure.add_gridspec(rows, COLUMNS)
+    for i, panel in enumerate(panels):
+        row, column = divmod(i, COLUMNS)
+        last = COLUMNS if i == len(panels) - 1 else column + 1  # the last one fills its row
+        panel(figure.add_subplot(grid[row, column:last]))
+    color = BLACK if solution.certified else VERMILLION
+    figure.suptitle(_title(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
+    return save_figure(figure, path)
+
+
+def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | None = None) -> Path:
+    """Draws the cheapest of a solution's distinct optima as a PNG, and returns its path.
+
+    Each is drawn as replayed. With `draw`: side by side, up to `MAPS` of them, one panel each.
+    Without: over each other, as many as there are colors, one panel for each of the first
+    `PANELS` coordinates of the state.
+
+    Args:
+        solution: from `solve`.
+        path: where to, ending in .png; its folder is made if need be.
+        draw: draw(axes, states (K + 1, nx)); tasks may have one.
+
+    Raises:
+        DraxError: no chain is certified, or the path cannot be written.
+    """
+    found = solution.optima
+    if not found:
+        raise DraxError(
+            f"{solution.problem.name} has no optima to draw: no chain is certified. See "
+            "solution.certificate."
+        )
+    panels: list[Callable[[Axes], None]]
+    if draw is not None:
+        shown = found[:MAPS]
+        panels = [
+            partial(_draw_map, rank=rank, optimum=optimum, draw=draw)
+            for rank, optimum in enumerate(shown, 1)
+        ]
+        columns, size = min(3, len(panels)), (3.0, 3.2)
+    else:
+        shown = found[: len(CURVES)]
+        groups = _state_groups(solution.problem.dynamics)
+        named = sorted(pair for _, names in groups for pair in names.items())
+        labels = [label for _, label in named]
+        panels = [
+            partial(_draw_ways, optima=shown, column=i, label=label, times=solution.problem.times)
+            for i, label in enumerate(labels[:PANELS])
+        ]
+        columns, size = min(COLUMNS, len(panels)), (4.0, 2.6)
+    rows = -(-len(panels) // columns)
+    inches = (max(size[0] * columns, 5.0), size[1] * rows + 0.8)
+    figure = Figure(inches, DPI, layout="constrained", facecolor="white")
+    for i, panel in enumerate(panels, 1):
+        panel(figure.add_subplot(rows, columns, i))
+    if draw is None:
+        names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+    drawn = "" if len(shown) == len(found) else f", the cheapest {len(shown)}"
+    figure.suptitle(
+        f"{solution.problem.name}: {len(found)} distinct optima{drawn}, as replayed",
+        fontsize=9,
+        parse_math=False,
+    )
+    return save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Writes a figure as a PNG, its folder made if need be; or a DraxError."""
+    target = file_path(path)
+    with complete(target, (".png",)) as partial:
+        FigureCanvasAgg(figure).print_png(partial)
+    return target
+
+
+def _title(solution: Solution) -> str:
+    chain, certificate = solution.best_chain, solution.certificate
+    return "\n".join(
+        [
+            f"{solution.problem.name}: {'certified' if solution.certified else 'NOT CERTIFIED'}",
+            f"cost {solution.cost[chain]:.4g},  max|h| {solution.max_defect[chain]:.1g},  "
+            f"bound violation {solution.max_violation[chain]:.1g},  "
+            f"{solution.success_rate:.0%} of {solution.chains} chains succeed",
+            *(
+                f"{certificate.engine}, {mode}: {solution.outcome(mode)}"
+                for mode in (OPEN_LOOP, WITH_FEEDBACK)
+            ),
+        ]
+    )
+
+
+# The best chain
+
+
+def _draw_scene(axes: Axes, solution: Solution, draw: Draw) -> None:
+    """The replayed motion among its surroundings, as the task draws it."""
+    draw(axes, finite(solution.replayed[0]))
+    axes.set_title("replayed motion", loc="left", fontsize=9, fontweight="bold")
+    axes.tick_params(labelsize=8)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.label.set_fontsize(8)
+
+
+# Distinct optima
+
+
+def _name(rank: int, optimum: Optimum) -> str:
+    share = f"{optimum.share:.0%}" if optimum.share >= 0.01 else f"{optimum.share:.1%}"
+    return f"{rank}: cost {optimum.cost:.4g}, {share} of chains"
+
+
+def _draw_map(axes: Axes, rank: int, optimum: Optimum, draw: Draw) -> None:
+    """One optimum among its surroundings, as the task draws it."""
+    draw(axes, optimum.replayed[0])
+    axes.set_title(_name(rank, optimum), loc="left", fontsize=8, fontweight="bold")
+    axes.set(xlabel="", ylabel="")
+    axes.tick_params(labelsize=7)
+
+
+def _draw_ways(
+    axes: Axes, optima: Sequence[Optimum], column: int, label: str, times: np.ndarray
+) -> None:
+    """One coordinate of the state over time, a curve for every optimum; the cheapest on top."""
+    for i, optimum in enumerate(optima):
+        axes.plot(
+            times,
+            optimum.replayed[0][:, column],
+            color=CURVES[i],
+            linestyle=DASHES[i],
+            lw=1.8,
+            zorder=3 - i / len(optima),
+            label=_name(i + 1, optimum),
+        )
+    axes.set_xlim(times[0], times[-1])
+    label_panel(axes, label, "time [s]", [])
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Quantities of one kind, columns of (K + 1, n) arrays for states, (K, n) for controls."""
+
+    title: str
+    labels: Sequence[str]
+    plan: np.ndarray
+    replay: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def parts(self) -> list[Curves]:
+        """As few as hold no more curves than there are colors."""
+        count = -(-len(self.labels) // len(CURVES))
+        return [
+            Curves(self.title, self.labels[i:j], *(a[:, i:j] for a in self._arrays))
+            for i, j in pairwise(round(k * len(self.labels) / count) for k in range(count + 1))
+        ]
+
+    @property
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        return self.plan, self.replay, self.lower, self.upper
+
+    def draw(self, axes: Axes, times: np.ndarray, mode: str) -> None:
+        """Plan dashed, replay solid, bounds dotted."""
+        held = len(self.plan) < len(times)  # a control lasts until the next knot
+        plan, replay, *ends = (np.vstack([a, a[-1:]]) if held else a for a in self._arrays)
+        style: Any = {"drawstyle": "steps-post" if held else "default"}
+        shared = all(np.array_equal(end[:, 0], row) for end in ends for row in end.T)
+        handles = []
+        for i, label in enumerate(self.labels):
+            color = CURVES[i % len(CURVES)]
+            handles += axes.plot(times, replay[:, i], color=color, lw=2.4, label=label, **style)
+            dark = [0.4 * part for part in to_rgb(color)]
+            axes.plot(times, plan[:, i], "--", color=dark, lw=1.0, **style)
+            for end in ends:
+                bound = GRAY if shared else color
+                axes.plot(times, end[:, i], ":", color=bound, lw=1.3, **style)
+        low, high = _limits(plan, replay, ends if held else [])
+        rows = -(-len(handles) // 3)
+        axes.set_ylim(low, high + 0.13 * rows * (high - low))  # the legend stands above the curves
+        axes.set_xlim(times[0], times[-1])
+        label_panel(axes, self.title, "time [s]", handles, loc="upper left", ncols=3)
+        axes.set_title(f"plan dashed, replay ({mode}) solid", loc="right", fontsize=7, color=GRAY)
+
+
+def _motion(solution: Solution) -> list[Curves]:
+    """States, then controls, of the best chain."""
+    problem, best = solution.problem, solution.best
+    plan = np.vstack([problem.x_init, best.x])
+    states, controls = solution.replayed
+    lower, upper = (
+        np.vstack([side.x[:1], side.x]).astype(float) for side in problem.bounds.sides(best)
+    )
+    groups = []
+    for title, names in _state_groups(solution.problem.dynamics):
+        arrays = (a[:, list(names)] for a in (plan, states, lower, upper))
+        groups += Curves(title, list(names.values()), *arrays).parts()
+    limits = (np.asarray(side.u) for side in problem.bounds.sides(best))
+    labels = _control_labels(problem.dynamics)
+    return groups + Curves("controls", labels, np.asarray(best.u), controls, *limits).parts()
+
+
+def _state_groups(dynamics: Dynamics) -> list[tuple[str, dict[int, str]]]:
+    """Titles of groups of states, with the columns that belong to them and their names."""
+    model = getattr(dynamics, "mj_model", None)
+    if model is None:
+        return [("states", {i: f"x[{i}]" for i in range(dynamics.nx)})]
+    positions: dict[int, str] = {}
+    quaternions: dict[int, str] = {}
+    velocities: dict[int, str] = {}
+    for j in range(model.njnt):
+        name, kind = model.joint(j).name or f"joint {j}", int(model.jnt_type[j])
+        q, v = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
+        if kind in (2, 3):  # slide, hinge
+            unit = {2: "m", 3: "rad"}[kind]
+            positions[q], velocities[v] = f"{name} [{unit}]", f"{name} [{unit}/s]"
+            continue
+        if kind == 0:  # free: a place, then what a ball has
+            positions |= {q + i: f"{name} {axis} [m]" for i, axis in enumerate("xyz")}
+            velocities |= {v + i: f"{name} {axis} [m/s]" for i, axis in enumerate("xyz")}
+            q, v = q + 3, v + 3
+        quaternions |= {q + i: f"{name} q{part}" for i, part in enumerate("wxyz")}
+        velocities |= {v + i: f"{name} turn {axis} [rad/s]" for i, axis in enumerate("xyz")}
+    first = model.nq + model.nv
+    activations = {first + i: f"act[{i}]" for i in range(model.na)}
+    groups = {
+        "positions": positions,
+        "orientations": quaternions,
+        "velocities": velocities,
+        "activations": activations,
+    }
+    return [(title, names) for title, names in groups.items() if names]
+
+
+def _control_labels(dynamics: Dynamics) -> list[str]:
+    model = getattr(dynamics, "mj_model", None)
+    if model is None:
+        return [f"u[{i}]" for i in range(dynamics.nu)]
+    return [model.actuator(i).name or f"actuator {i}" for i in range(dynamics.nu)]
+
+
+def _limits(
+    plan: np.ndarray, replay: np.ndarray, bounds: Sequence[np.ndarray]
+) -> tuple[float, float]:
+    """Ends of the vertical axis: plan, finite bounds, and the replay if near."""
+    needed = np.concatenate([np.ravel(a) for a in (plan, *bounds)])
+    needed = needed[np.isfinite(needed)]
+    low, high = (needed.min(), needed.max()) if needed.size else (-1.0, 1.0)
+    span = max(high - low, 1e-3)
+    near = np.clip(replay[np.isfinite(replay)], low - span, high + span)
+    low, high = min(low, near.min(initial=low)), max(high, near.max(initial=high))
+    return low - 0.06 * span, high + 0.06 * span
+
+
+# All chains
+
+
+def _draw_history(
+    axes: Axes, solution: Solution, values: np.ndarray, shown: np.ndarray, color: str
+) -> list[Artist]:
+    """Median and range over the chains shown, where (records, chains), at every record."""
+    iterations = solution.history["iteration"]
+    spread = np.full((len(values), 3), np.nan)
+    for row, (value, chosen) in enumerate(zip(values, shown & np.isfinite(values), strict=True)):
+        if chosen.any():
+            spread[row] = np.quantile(value[chosen], (0.0, 0.5, 1.0))
+    low, median, high = spread.T
+    band = axes.fill_between(iterations, low, high, color=color, alpha=0.25, lw=0)
+    band.set_label("smallest to largest")
+    handles: list[Artist] = [*axes.plot(iterations, median, ".-", ms=3, lw=1.6, color=color)]
+    handles[0].set_label("median")
+    began, ended = solution.history["began"], solution.history["noise_ends"]
+    for marks, dash, label in (
+        (began[1:], "-", "next attempt"),
+        (ended[ended > began], "--", "noise ends"),
+    ):
+        for mark in marks:
+            line = axes.axvline(mark, ls=dash, lw=1, color=GRAY, zorder=1)
+        if len(marks):
+            line.set_label(label)
+            handles.append(line)
+    axes.set_xlim(0, max(1, iterations[-1]))
+    return [*handles, band]
+
+
+def _draw_defects(axes: Axes, solution: Solution) -> None:
+    values = solution.history["max_defect"]
+    handles = _draw_history(axes, solution, values, np.ones_like(values, bool), BLUE)
+    label = f"feasible: below {FEASIBLE:g}"
+    handles.append(axes.axhline(FEASIBLE, ls=":", lw=1.2, color=BLACK, label=label))
+    axes.set_yscale("log")
+    label_panel(axes, "max|h| of all chains", "iteration", handles)
+
+
+def _draw_costs(axes: Axes, solution: Solution) -> None:
+    feasible = solution.history["max_defect"] < FEASIBLE
+    handles = _draw_history(axes, solution, solution.history["cost"], feasible, VERMILLION)
+    _scale_costs(axes, solution.history["cost"][feasible])
+    nothing = "" if feasible.any() else ": there are none"
+    label_panel(axes, f"cost of feasible chains{nothing}", "iteration", handles)
+
+
+def _draw_chains(axes: Axes, solution: Solution) -> None:
+    """Final costs in rising order; what is infeasible may undercut the optimum."""
+    cost = np.asarray(solution.cost, float)
+    rank = np.empty(len(cost), int)
+    rank[np.argsort(cost, kind="stable")] = np.arange(1, len(cost) + 1)
+    diverged = solution.died_at >= 0
+    handles: list[Artist] = []
+    for name, chosen, marker, color in (
+        ("succeeds", solution.success, "o", GREEN),
+        ("feasible, replay fails", solution.feasible & ~solution.success, "s", ORANGE),
+        ("infeasible", ~solution.feasible & ~diverged, "x", VERMILLION),
+        ("diverged", diverged, "+", BLACK),
+    ):
+        if chosen.any():
+            label = f"{name}: {np.count_nonzero(chosen)}"
+            hidden = np.count_nonzero(~np.isfinite(cost[chosen]))
+            label += f" ({hidden} without a finite cost)" if hidden else ""
+            handles += axes.plot(
+                rank[chosen], cost[chosen], marker, ms=5, color=color, label=label, clip_on=False
+            )
+    best = solution.best_chain
+    handles += axes.plot(
+        rank[best], cost[best], "o", ms=11, mfc="none", color=BLUE, label="best", clip_on=False
+    )
+    _scale_costs(axes, cost)
+    axes.set_xlim(0, len(cost) + 1)
+    label_panel(axes, "final cost of every chain", "chains in order of cost", handles)
+
+
+def _scale_costs(axes: Axes, costs: np.ndarray) -> None:
+    """A logarithmic axis for positive costs that differ much; else one of 2 % or more."""
+    costs = costs[np.isfinite(costs)]
+    if not costs.size:
+        axes.set_yticks([])
+        return
+    low, high = float(costs.min()), float(costs.max())
+    if 0.0 < 10.0 * low < high:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(NullLocator())
+        return
+    pad = max(0.06 * (high - low), 0.01 * abs(high), 1e-9)
+    axes.set_ylim(low - pad, high + pad)
+    axes.ticklabel_format(axis="y", useOffset=False)
+
+
+def label_panel(
+    axes: Axes, title: str, xlabel: str, handles: Sequence[Artist], **legend_style: Any
+) -> None:
+    """What every panel has."""
+    axes.set_title(title, loc="left", fontsize=9, fontweight="bold", parse_math=False)
+    axes.set_xlabel(xlabel, fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.grid(True, color="0.9", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if not handles:
+        return
+    legend = axes.legend(
+        handles=list(handles), fontsize=7, framealpha=0.8, edgecolor="none", **legend_style
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
