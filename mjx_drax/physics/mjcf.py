@@ -315,6 +315,14 @@ class MjxDynamics(Dynamics):
         return data
 
 
+def mujoco_model(dynamics: Dynamics) -> mujoco.MjModel | None:
+    """The MuJoCo model that the dynamics come from; None if they come from a function.
+
+    The one place that asks whether a problem is MuJoCo's.
+    """
+    return dynamics.mj_model if isinstance(dynamics, MjxDynamics) else None
+
+
 def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     static = (dynamics.host, dynamics.substeps, dynamics.structure)
     return (dynamics.model, dynamics.dt, dynamics.derivatives), static

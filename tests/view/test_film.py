@@ -232,7 +232,7 @@ def test_what_has_no_timelapse(cartpole: Solution, trapped: Solution, tmp_path: 
 def test_bodies_that_travel() -> None:
     names = {"cartpole": None, "quadrotor": "quadrotor", "car_bug_trap": "car"}
     for name, body in names.items():
-        path = Path(__file__).parents[1] / "models" / f"{name}.xml"
+        path = Path(__file__).parents[2] / "models" / f"{name}.xml"
         model = mujoco.MjModel.from_xml_path(str(path))
         index = ghosts.travelling_body(model)
         assert (None if index is None else model.body(index).name) == body
@@ -269,7 +269,7 @@ def test_slow_motion_and_the_free_camera() -> None:
     assert len(rendering.frame_times(times, 10.0, 0.5)) == 21 + 5
     with pytest.raises(DraxError, match="speed"):
         rendering.frame_times(times, 10.0, 0.0)
-    path = Path(__file__).parents[1] / "models" / "cartpole.xml"
+    path = Path(__file__).parents[2] / "models" / "cartpole.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
     poses = np.array([[0.5, 0.0], [0.7, 3.0]])
     near = rendering.view_of(model, poses, rendering.FREE, 1.3)

@@ -361,7 +361,7 @@ def test_terms_go_where_functions_go():
 
 
 def test_the_example_of_the_readme():
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
     code = next(c for c in readme.split("```")[1::2] if "Terms(" in c)
     code = code.removeprefix("python").replace('"robot.xml"', repr(str(path("cartpole"))))
     code, call = code.split("solution = mjx_drax.solve(problem, chains=64, guess=")

@@ -23,7 +23,7 @@ from mjx_drax.solution.solution import Solution, solve
 from mjx_drax.tasks import load
 from mjx_drax.view import rendering
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 120, 160
 
 

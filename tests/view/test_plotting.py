@@ -147,7 +147,7 @@ def test_paths_that_cannot_be_written(pendulum: Solution, tmp_path: Path) -> Non
 
 
 def _dynamics(name: str) -> SimpleNamespace:
-    path = Path(__file__).parents[1] / "models" / f"{name}.xml"
+    path = Path(__file__).parents[2] / "models" / f"{name}.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
     return SimpleNamespace(mj_model=model, ndx=2 * model.nv + model.na)
 
