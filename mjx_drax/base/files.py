@@ -8,9 +8,12 @@ from __future__ import annotations
 import contextlib
 import glob
 import importlib.util
+import json
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from mjx_drax.base.errors import DraxError, shown
 
@@ -60,6 +63,34 @@ def complete(path: str | os.PathLike[str], suffixes: tuple[str, ...] = ()) -> It
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def write_json(path: str | os.PathLike[str], data: Any) -> Path:
+    """Write nested dicts, lists, numbers and texts as JSON; returns the path.
+
+    Args:
+        path: of the file, ending in .json.
+        data: may hold NumPy and JAX arrays; a number that is not finite becomes null.
+
+    Raises:
+        DraxError: the file cannot be written.
+    """
+    text = json.dumps(json_data(data), indent=2, ensure_ascii=False, allow_nan=False)
+    with complete(path, (".json",)) as partial:
+        # What UTF-8 cannot hold, as in some names of files, becomes an escape that JSON knows.
+        partial.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    return file_path(path)
+
+
+def json_data(data: Any) -> Any:
+    """The same data as JSON knows it: arrays as lists, None where a number is not finite."""
+    if hasattr(data, "tolist"):  # arrays and their scalars; this room does not import NumPy
+        data = data.tolist()
+    if isinstance(data, dict):
+        return {name: json_data(value) for name, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [json_data(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def _partial(target: Path, process: str) -> str:
