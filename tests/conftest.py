@@ -114,3 +114,15 @@ def without(monkeypatch):
         monkeypatch.setattr(importlib.util, "find_spec", found)
 
     return hide
+
+
+@pytest.fixture
+def nothing_iterates(monkeypatch):
+    """A solve that asks its metric for a direction has not complained in time."""
+    from mjx_drax import LBFGS, Diagonal, GaussNewton, Identity
+
+    def far(*_, **__):
+        pytest.fail("it got as far as iterating")
+
+    for metric in (LBFGS, Diagonal, GaussNewton, Identity):
+        monkeypatch.setattr(metric, "direction", far)

@@ -1,0 +1,196 @@
+"""What many tests are made of: small problems, solutions, and what a good error looks like."""
+
+import functools
+import json
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjx_drax import (
+    DraxError,
+    Langevin,
+    Solution,
+    Terms,
+    Trajectory,
+    from_function,
+    from_mjcf,
+    from_program,
+)
+from mjx_drax.method.metrics import Multipliers
+from mjx_drax.problem.trajectory import Stagewise
+from mjx_drax.solution.solution import Replays
+
+INF, NAN = math.inf, math.nan
+
+# Problems
+
+
+def arm(body="", option='timestep="0.01"', actuator=None, more="", joint=""):
+    """MJCF of one link that a motor turns, and what is put into it."""
+    motor = '<motor name="torque" joint="elbow" ctrlrange="-1 1" ctrllimited="true"/>'
+    home = "0.1 1 0 0 0" if "hip" in body else "0.1"
+    return f"""
+<mujoco model="arm"><option {option}/><worldbody>
+  <body name="link"><joint name="elbow" axis="0 1 0" range="-90 90" limited="true" {joint}/>
+    <geom name="rod" type="capsule" size="0.02 0.1" mass="1"/>
+    <geom name="tray" type="cylinder" size="0.1 0.01" mass="1"/><site name="tip"/></body>{body}
+</worldbody><actuator>{motor if actuator is None else actuator}</actuator>
+<sensor><jointpos name="angle" joint="elbow"/></sensor>
+<keyframe><key name="home" qpos="{home}"/></keyframe>{more}</mujoco>
+"""
+
+
+BALL = (
+    '<body name="egg" pos="1 0 0"><joint name="hip" type="ball"/>'
+    '<geom mass="1" size="0.1" contype="0" conaffinity="0"/></body>'
+)
+"""A body of `arm` that turns freely."""
+
+
+def point(**changes):
+    """A problem from a function; the defaults are good."""
+    given = {"f": lambda x, u: x + 0.1 * u, "x_init": [0.0, 0.0], "nu": 2, "dt": 0.1}
+    given |= {"horizon": 1.0, "terminal_residual": lambda x: x - 1.0, "name": "point"}
+    return from_function(**{**given, **changes})
+
+
+def robot(model=None, **changes):
+    """A problem from MJCF; the defaults are good."""
+    given = {"horizon": 0.1, "terminal_residual": lambda data: data.qpos}
+    return from_mjcf(arm() if model is None else model, **{**given, **changes})
+
+
+def made_up(problem, chains=2):
+    """A solution that was never solved for."""
+    K, d = problem.horizon, problem.dynamics
+    x, u = np.zeros((chains, K, d.nx), np.float32), np.zeros((chains, K, d.nu), np.float32)
+    zero, whole = np.zeros(chains, np.float32), np.zeros(chains, int)
+    states, good = np.zeros((chains, K + 1, d.nx)), np.ones(chains, bool)
+    replays = Replays(states, u, zero, zero, zero, zero, good)
+    constraints = Stagewise(np.zeros((chains, K, 0)), np.zeros((chains, 0)))
+    return Solution(
+        problem=problem,
+        solver=Langevin(),
+        seed=0,
+        trajectories=Trajectory(x, u),
+        multipliers=Multipliers(np.zeros((chains, K, d.ndx)), constraints, None),
+        gains=np.zeros((chains, K, d.nu, d.ndx)),
+        cost=zero,
+        max_defect=zero,
+        max_violation=zero,
+        converged_at=whole,
+        died_at=whole - 1,
+        open_loop=replays,
+        feedback=replays,
+        history={
+            "iteration": np.arange(2),
+            "cost": np.zeros((2, chains)),
+            "max_defect": np.zeros((2, chains)),
+            "began": np.zeros(1, int),
+            "noise_ends": np.zeros(1, int),
+        },
+        iterations=1,
+        compile_time=0.0,
+        solve_time=0.0,
+        engine=problem.dynamics.engine,
+    )
+
+
+@functools.cache
+def parts():
+    """What many cases share: problems, terms, and solutions of them."""
+    good = {
+        "robot": robot(),
+        "ball": robot(arm(BALL)),
+        "point": point(),
+        "bounded": point(x_bounds=(-1, 1)),
+        "terms": Terms(arm()),
+        "program": from_program(2, cost=lambda x: x @ x),
+    }
+    good["answer"] = made_up(good["robot"])
+    good["point_answer"] = made_up(good["point"])
+    good["uncertified"] = replace(good["answer"], max_defect=np.ones(2, np.float32))
+    return good
+
+
+# Bad input: each case is (name, call, words). The call gets an `At` and must raise a DraxError
+# whose message holds the words, which name what is wrong and its value.
+
+
+@dataclass
+class At:
+    """Where a case takes place: a folder of its own, and the `parts` by name."""
+
+    folder: Path
+
+    def __getattr__(self, name):
+        return parts()[name]
+
+    def file(self, name, content=b""):
+        """A file with some content."""
+        path = self.folder / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    def saved(self, name="answer", **summary):
+        """A folder with a saved solution, some entries of result.json replaced."""
+        folder = parts()[name].save(self.folder / "result")
+        if summary:
+            path = folder / "result.json"
+            said = {k: v for k, v in json.loads(path.read_text()).items() if k != "json_sha256"}
+            path.write_text(json.dumps({**said, **summary}))
+        return folder
+
+
+def cut_short(path):
+    """Leaves the first 500 bytes of a file."""
+    path.write_bytes(path.read_bytes()[:500])
+
+
+def cases(**groups):
+    """The parameters of a test, from lists of cases; no name twice."""
+    found = [
+        pytest.param(call, words, id=f"{group}-{name}")
+        for group, rows in groups.items()
+        for name, call, *words in rows
+    ]
+    assert len({case.id for case in found}) == len(found)
+    return found
+
+
+FIXES = re.compile(
+    r"\b(add|call|change|check|choose|clear|correct|drive|give|install|keep|leave|load|make|map|"
+    r"move|must|narrow|needs|pass|remove|rename|return|route|scale|see|set|solve|stack|there is|"
+    r"undo|use|widen)\b",
+    re.IGNORECASE,
+)
+"""Words that say what to do; where names are listed, that is what to choose from."""
+
+
+def assert_complains(call, words):
+    """A call raises a DraxError of one short line that says what to do, and holds the words."""
+    with pytest.raises(DraxError) as caught:
+        call()
+    assert type(caught.value) is DraxError
+    message = str(caught.value)
+    assert len(message) <= 400, message
+    for mark in ("\n", "Traced<", "Tracer<", "Traceback", "jax._src", "0x7f", "ShapedArray("):
+        assert mark not in message, message
+    assert FIXES.search(message), message
+    for word in words:
+        assert word in message, message
+
+
+def outcome(call):
+    """What a call returns, or the DraxError, which must have something to say."""
+    try:
+        return call()
+    except DraxError as error:
+        message = str(error)
+        assert 10 < len(message) <= 600
+        assert "\n" not in message
+        return error

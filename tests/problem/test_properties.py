@@ -1,0 +1,42 @@
+"""Any argument makes a problem, or a DraxError says why not; nothing else is raised."""
+
+import numpy as np
+from builders import outcome, point
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import anything, bounded
+
+from mjx_drax import DraxError, from_function
+
+ARGUMENTS = ("x_init", "horizon", "dt", "nu", "x_bounds", "u_bounds", "x_scatter", "u_scatter")
+FUNCTIONS = ("f", "running_cost", "terminal_residual", "equality", "inequality", "goal", "guess")
+
+
+@bounded
+@given(name=st.sampled_from([*ARGUMENTS, *FUNCTIONS, "name"]), value=anything)
+def test_any_argument_makes_a_problem_or_a_complaint(name, value):
+    problem = outcome(lambda: point(**{name: value}))
+    if not isinstance(problem, DraxError):
+        assert np.isfinite(problem.x_init).all()
+        assert problem.horizon >= 1
+        for side in (problem.scatter.x_upper, problem.scatter.u_lower):
+            assert np.isfinite(side).all()
+
+
+@bounded
+@given(value=anything)
+def test_any_value_of_a_function_makes_a_problem_or_a_complaint(value):
+    for name in ("running_cost", "running_residual", "equality"):
+        outcome(lambda name=name: point(**{name: lambda x, u: value}))
+    outcome(lambda: point(f=lambda x, u: value))
+    outcome(lambda: point(goal=lambda x: value))
+    outcome(lambda: point(guess=lambda key: value))
+
+
+def test_problems_that_are_good_are_built():
+    """That all is not refused."""
+    assert from_function(lambda x, u: u, x_init=[0], nu=1, dt=1, horizon=3, running_cost=_cost)
+
+
+def _cost(x, u):
+    return u @ u
