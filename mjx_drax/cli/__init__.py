@@ -79,7 +79,7 @@ OPTIMA = 5
 """So many distinct optima are printed."""
 
 SUITES = ("cpu", "gpu", "devices", "peers")
-REPRODUCIBLE = ("phase-portrait", "convergence", "bug-trap", "parallel-table", "open-questions")
+from mjx_drax.studies.reproduce import NAMES as REPRODUCIBLE  # noqa: E402
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -574,7 +574,9 @@ def _reproduce(options: argparse.Namespace) -> int:
 
     _cache_compilations()
     numbers = reproduce.run(options.name, options.out, options.chains, options.iterations)
-    say(reproduce.table(numbers))
+    from mjx_drax.studies.reproduce.output import table
+
+    say(table(numbers))
     say(f"written to {options.out}/: {options.name}.png, {options.name}.json")
     return 0
 

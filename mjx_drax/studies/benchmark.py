@@ -28,6 +28,7 @@ import numpy as np
 
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import write_json
 from mjx_drax.method.langevin import Langevin, evaluate
 from mjx_drax.method.metrics import Diagonal
 from mjx_drax.method.schedules import Geometric
@@ -42,15 +43,15 @@ from mjx_drax.studies.measurements import (
     shoot,
     tuned,
 )
-from mjx_drax.studies.peers.cem import CEM
-from mjx_drax.studies.peers.ipopt import FUNCTIONS, Transcription, require_casadi
-from mjx_drax.studies.peers.mbd import MBD
-from mjx_drax.studies.peers.mppi import MPPI
-from mjx_drax.studies.reproduce import PENDULUM_FLOW, TRAP_FLOW
+from mjx_drax.studies.other_methods.cem import CEM
+from mjx_drax.studies.other_methods.ipopt import FUNCTIONS, Transcription, require_casadi
+from mjx_drax.studies.other_methods.mbd import MBD
+from mjx_drax.studies.other_methods.mppi import MPPI
+from mjx_drax.studies.reproduce.settings import PENDULUM_FLOW, TRAP_FLOW
 
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
-    from mjx_drax.studies.peers.shooting import Method
+    from mjx_drax.studies.other_methods.shooting import Method
 
 GPU_CHAINS = {
     "pendulum": 16_384,
@@ -238,7 +239,7 @@ def one_thread(seed: int, chains: Sequence[int] = ONE_THREAD_CHAINS) -> list[Row
     Raises:
         DraxError: the process fails.
     """
-    code = "import mjx_drax.studies.peers.one_thread as child; child.main()"
+    code = "import mjx_drax.studies.one_thread as child; child.main()"
     result = subprocess.run(
         [sys.executable, "-c", code, str(seed), *map(str, chains)],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)},
@@ -313,16 +314,8 @@ def save(rows: Sequence[Row], folder: str | os.PathLike[str]) -> list[Path]:
     """Write `benchmark.json`, the list of rows, and `benchmark.png`, success against time."""
     from mjx_drax.studies.benchmark_plot import plot
 
-    path = Path(folder) / "benchmark.json"
-    text = json.dumps([_finite(row) for row in rows], indent=1, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")
-    return [path, plot(rows, Path(folder) / "benchmark.png")]
-
-
-def _finite(value: Any) -> Any:
-    """The same with None where JSON has no number."""
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    target = Path(folder)
+    return [
+        write_json(target / "benchmark.json", rows),
+        plot(rows, target / "benchmark.png"),
+    ]

@@ -39,15 +39,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.method.langevin import FEASIBLE, Info, Langevin, evaluate
-from mjx_drax.problem.problem import Problem, Trajectory
+from mjx_drax import __version__
+from mjx_drax.method.langevin import FEASIBLE, Info, Langevin, worth
+from mjx_drax.problem.problem import Problem
 from mjx_drax.search.restarts import Restarts
-from mjx_drax.solution.solution import OUTSIDE, Solution, solve
-from mjx_drax.studies.peers import shooting
-from mjx_drax.studies.reproduce import many
+from mjx_drax.solution.solution import Solution, judged, solve
+from mjx_drax.studies.many_starts import solve_each
+from mjx_drax.studies.other_methods import shooting
 
 if TYPE_CHECKING:
-    from mjx_drax.studies.peers.ipopt import Transcription
+    from mjx_drax.studies.other_methods.ipopt import Transcription
 
 Row = dict[str, Any]
 
@@ -71,6 +72,7 @@ FIELDS = (
     "curve",
     "device",
     "cpus",
+    "mjx_drax",
     "jax",
     "python",
 )
@@ -109,6 +111,7 @@ def machine() -> Row:
     return {
         "device": device.device_kind,
         "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "mjx_drax": __version__,
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
@@ -252,31 +255,18 @@ class Verdicts:
 
 
 def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> Verdicts:
-    """Replay controls (n, K, nu) from x_init, the problem's or (n, nx), as certificates do.
-
-    A replay succeeds that reaches the goal and leaves the states' bounds by `OUTSIDE` at most.
-    """
-    dynamics, bounds, count = problem.dynamics, problem.bounds, len(u)
-    plan = np.zeros((count, problem.horizon + 1, dynamics.nx))
+    """Replay controls (n, K, nu) from x_init, the problem's or (n, nx), as certificates do."""
+    plan = np.zeros((len(u), problem.horizon + 1, problem.dynamics.nx))
     plan[:, 0] = np.asarray(problem.x_init, float) if x_init is None else x_init
-    gains = np.zeros((*u.shape, dynamics.ndx))
-    states, applied = problem.replay(plan, u, gains)
-    below = np.asarray(bounds.x_lower) - states[:, 1:]
-    above = states[:, 1:] - np.asarray(bounds.x_upper)
-    inside = np.maximum(below, above).max(axis=(1, 2)) < OUTSIDE
-    success = [
-        bool(ok and np.isfinite(x).all() and problem.reached(x[-1]) is not False)
-        for ok, x in zip(inside, states, strict=True)
-    ]
-    knots = Trajectory(jnp.asarray(states[:, 1:], float), jnp.asarray(applied, float))
-    return Verdicts(
-        np.array(success),
-        np.asarray(evaluate(problem, knots).cost),
-        _seconds(problem, plan[:1], u[:1], gains[:1]),
-    )
+    gains = np.zeros((*u.shape, problem.dynamics.ndx))
+    ran = problem.replay(plan, u, gains)
+    replays = judged(problem, ran[0], ran, partial(worth, problem))  # planned is what happened
+    seconds = _seconds(problem, plan[:1], u[:1], gains[:1])
+    return Verdicts(replays.success, replays.cost, seconds)
 
 
 def _seconds(problem: Problem, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> float:
+    """Time of a replay [s], once compiled."""
     for _ in range(2):  # the first compiles
         clock = time.perf_counter()
         problem.replay(plan, u, gains)
@@ -289,7 +279,7 @@ def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | Non
     Raises:
         DraxError: casadi is not installed, or the problem is not written for it.
     """
-    from mjx_drax.studies.peers.ipopt import Transcription
+    from mjx_drax.studies.other_methods.ipopt import Transcription
 
     clock = time.perf_counter()
     program = program or Transcription(problem)
@@ -392,37 +382,31 @@ def random_states(
     `program`). States and random keys are the same however many there are. `best_cost` and
     `max_defect` are medians over the states, `chains` their number.
     """
-    states, chain_keys = random_starts(problem.dynamics.nx, count, seed)
-    total, tail = int(solver.iterations) + int(solver.tail), int(solver.tail) > 0
-    clock = time.perf_counter()
-    compiled = many.lower(solver, problem, states, chain_keys, total, tail).compile()
-    jax.block_until_ready(compiled(solver, problem, states, chain_keys))  # loads, allocates
-    compile_time = time.perf_counter() - clock
-    clock = time.perf_counter()
-    trajectory, info = jax.block_until_ready(compiled(solver, problem, states, chain_keys))
-    seconds = time.perf_counter() - clock
-    defect, cost = np.asarray(info.max_defect), np.asarray(info.cost)
-    success = judge(problem, np.asarray(trajectory.u), np.asarray(states, float)).success
-    feasible = defect < 1e-5
+    states, keys = random_starts(problem.dynamics.nx, count, seed)
+    answers = solve_each(solver, problem, states, keys)
+    defect, cost = np.asarray(answers.info.max_defect), np.asarray(answers.info.cost)
+    u, x_init = np.asarray(answers.trajectory.u), np.asarray(states, float)
+    success = judge(problem, u, x_init).success & (defect < FEASIBLE)
+    total = int(solver.iterations) + int(solver.tail)
     found: Row = {
         "problem": f"{problem.name}, random x_init",
         "iterations": total,
-        "share_feasible_1e-5": float(feasible.mean()),
+        "share_feasible_1e-5": float((defect < 1e-5).mean()),
         "share_feasible_1e-3": float((defect < FEASIBLE).mean()),
-        "sample_x_init": np.asarray(states[:sample]).tolist(),
-        "sample_cost": [float(c) if np.isfinite(c) else None for c in cost[:sample]],
-        "sample_max_defect": [float(h) if np.isfinite(h) else None for h in defect[:sample]],
+        "sample_x_init": x_init[:sample],
+        "sample_cost": cost[:sample],
+        "sample_max_defect": defect[:sample],
     }
     if program is not None:
-        found |= _against_ipopt(program, np.asarray(states[:sample], float), cost, defect, starts)
+        found |= _against_ipopt(program, x_init[:sample], cost, defect, starts)
     return row(problem, OURS, seed, count) | {
-        "success_rate": float(np.mean(success & (defect < FEASIBLE))),
-        "certified": bool(np.any(success & (defect < FEASIBLE))),
+        "success_rate": float(success.mean()),
+        "certified": bool(success.any()),
         "best_cost": float(np.median(cost)),
         "max_defect": float(np.median(defect)),
         "evaluations": evaluations(solver, problem, count, total),
-        "compile_time_s": compile_time,
-        "solve_time_s": seconds,
+        "compile_time_s": answers.compile_time,
+        "solve_time_s": answers.solve_time,
         **found,
     }
 
@@ -451,7 +435,7 @@ def _against_ipopt(
     ratio = own[solved] / reference[solved]
     return {
         "cost_ratio": float(np.median(ratio)) if len(ratio) else None,
-        "sample_ipopt_cost": [float(c) if np.isfinite(c) else None for c in reference],
+        "sample_ipopt_cost": reference,
         "sample_ipopt_starts": starts,
         "sample_ipopt_time_s": seconds,
         "sample_feasible": int((defect[: len(states)] < FEASIBLE).sum()),

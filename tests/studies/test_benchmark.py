@@ -14,11 +14,11 @@ from mjx_drax.cli import main
 from mjx_drax.studies import benchmark
 from mjx_drax.studies import measurements as measure
 from mjx_drax.studies.benchmark_plot import pooled
-from mjx_drax.studies.peers import shooting
-from mjx_drax.studies.peers.cem import CEM
-from mjx_drax.studies.peers.ipopt import FUNCTIONS, Transcription
-from mjx_drax.studies.peers.mbd import MBD
-from mjx_drax.studies.peers.mppi import MPPI
+from mjx_drax.studies.other_methods import shooting
+from mjx_drax.studies.other_methods.cem import CEM
+from mjx_drax.studies.other_methods.ipopt import FUNCTIONS, Transcription
+from mjx_drax.studies.other_methods.mbd import MBD
+from mjx_drax.studies.other_methods.mppi import MPPI
 
 DT, KNOTS = 0.1, 20
 METHODS = [

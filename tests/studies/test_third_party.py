@@ -27,7 +27,7 @@ SMALL = [
     "gymnasium/reacher",
     "gymnasium/swimmer",
 ]
-"""Solved or refused within minutes on two cores; `python -m mjx_drax.studies.third_party` runs all."""
+"""Solved or refused within minutes on two cores; `third_party` without names runs all."""
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import Static, register_dataclass
-from mjx_drax.studies.peers.shooting import Plan
+from mjx_drax.studies.other_methods.shooting import Plan
 
 
 @register_dataclass

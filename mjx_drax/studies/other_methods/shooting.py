@@ -27,7 +27,8 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.problem.problem import Problem, Trajectory
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
 
 REPORTS = 25
 """Times at which the cheapest rollouts are looked at."""

@@ -16,7 +16,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.studies.peers.shooting import Plan, average
+from mjx_drax.studies.other_methods.shooting import Plan, average
 
 
 @register_dataclass

@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike
 
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
-from mjx_drax.problem.problem import Problem, Trajectory
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
 
 OPTIONS = {
     "print_time": False,
@@ -62,7 +63,7 @@ class Transcription:
         if problem.name not in FUNCTIONS:
             raise DraxError(
                 f"{problem.name} is not written for CasADi: choose one of {', '.join(FUNCTIONS)}, "
-                "or add its functions to mjx_drax/studies/peers/ipopt.py."
+                "or add its functions to mjx_drax/studies/other_methods/ipopt.py."
             )
         functions = FUNCTIONS[problem.name](casadi)
         self.problem = problem

@@ -1,0 +1,56 @@
+"""The paper's figures and table, and answers to its open questions: one file each.
+
+    phase_portrait    the pendulum's knots before and after, and its bang-bang controls
+    convergence       |h|^2 over the iterations for several penalties mu
+    bug_trap          gradient descent, quasi-Newton and diffusion side by side
+    parallel_table    N pendulums at once: time, and what the time bought
+    open_questions    preconditioning, annealing, noise or none, sampled or exact gradients
+
+Each has `make`, which returns numbers (`rows` of a table, `settings`, and more) and a figure; sizes
+are its arguments. `run` makes one by name and writes both. No number in these files is a result:
+there are settings, and the times that the paper published. A chain counts as feasible when
+max|h| < 1e-3. A goal counts as reached when the float64 rollout of the chain's controls, open loop,
+reaches it.
+
+Modules are imported where they are needed: the command line takes `NAMES` for its help.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from typing import Any
+
+NAMES = ("phase-portrait", "convergence", "bug-trap", "parallel-table", "open-questions")
+
+
+def run(
+    name: str,
+    folder: str | os.PathLike[str],
+    chains: int | None = None,
+    iterations: int | None = None,
+) -> dict[str, Any]:
+    """Make one of `NAMES`; write NAME.png and NAME.json into a folder.
+
+    Returns:
+        the numbers, with the machine and versions that they were measured with.
+
+    Raises:
+        DraxError: the folder cannot be written to.
+    """
+    from mjx_drax.base.files import write_json
+    from mjx_drax.search.settings import to_data
+    from mjx_drax.solution.save import writable
+    from mjx_drax.studies.measurements import machine
+    from mjx_drax.view.plotting import save_figure
+
+    target = writable(folder)
+    sizes = {"chains": chains, "iterations": iterations}
+    given = {key: value for key, value in sizes.items() if value is not None}
+    make = import_module(f"{__name__}.{name.replace('-', '_')}").make
+    numbers, figure = make(**given)
+    settings = {label: to_data(solver) for label, solver in numbers["settings"].items()}
+    numbers = {"name": name, **numbers, "settings": settings, **machine()}
+    save_figure(figure, target / f"{name}.png")
+    write_json(target / f"{name}.json", numbers)
+    return numbers
