@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.engine import mujoco
 
 
 class Shape(NamedTuple):

@@ -1,22 +1,17 @@
 """Initial guesses in state space: `solve(problem, guess=guesses.waypoints(problem, [...]))`.
 
 A path of positions q(t) becomes a trajectory: q_k = q(k dt), velocities by backward differences in
-tangent space, v_k = (q_k - q_{k-1}) / dt, and controls by the C engine's inverse dynamics,
+tangent space, v_k = (q_k - q_{k-1}) / dt, and controls by `physics.actuators.inverse_dynamics`,
+with the least change from rest, which is the middle of the control bounds (0 where they are
+infinite). An actuator with a state, whose force does not depend on u at once, stays at rest, and so
+do all actuators at a knot where there is no finite answer: a guess never fails for its controls.
 
-    min |A (u - rest) - b|,        A = d tau / d u,
-                                   b = tau(q_k, v_k, (v_{k+1} - v_k) / dt) - tau(rest),
-
-with the least change from rest, the middle of the control bounds (0 where they are infinite), and
-clipped to the bounds; limits of the actuators' forces are not heeded. An actuator with a state (its
-force does not depend on u at once) stays at rest, and so does every actuator at a knot where the
-engine finds no finite answer: a guess never fails for its controls. States are clipped to their
-bounds; activations stay as they are in x_init. Positions are moved by MuJoCo's own functions, so
-quaternions are turned about one axis and stay unit.
+States and controls are clipped to their bounds; activations stay as they are in x_init. Positions
+are interpolated by MuJoCo's own functions, which turn quaternions about one axis.
 """
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -32,11 +27,14 @@ from mjx_drax.base.errors import (
     require_whole,
     shown,
 )
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.mjcf import index
-from mjx_drax.physics.mjx_model import moment_arms
-from mjx_drax.physics.states import between, interpolated, moved, set_state
-from mjx_drax.problem.problem import Box, Problem, Trajectory, numbers
+from mjx_drax.base.numbers import numbers
+from mjx_drax.physics.actuators import inverse_dynamics, middle_control
+from mjx_drax.physics.dynamics import mujoco_model
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.source import index
+from mjx_drax.physics.states import between, interpolated, moved
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
 
 Pose = str | ArrayLike
 """Name of a keyframe, or qpos (nq,)."""
@@ -44,11 +42,11 @@ Pose = str | ArrayLike
 
 def still(problem: Problem) -> Trajectory:
     """The pose of x_init, held at rest; without a model, x_init and the middle of the controls."""
-    if not hasattr(problem.dynamics, "mj_model"):
-        K, dynamics = problem.horizon, problem.dynamics
-        x = np.broadcast_to(problem.x_init, (K, dynamics.nx))
-        return _bounded(problem, x, np.broadcast_to(middle(problem.bounds), (K, dynamics.nu)))
-    return waypoints(problem, [])
+    if mujoco_model(problem.dynamics) is not None:
+        return waypoints(problem, [])
+    K, dynamics = problem.horizon, problem.dynamics
+    x = np.broadcast_to(problem.x_init, (K, dynamics.nx))
+    return _bounded(problem, x, np.broadcast_to(middle_control(problem.bounds), (K, dynamics.nu)))
 
 
 def waypoints(problem: Problem, poses: Iterable[tuple[float, Pose]]) -> Trajectory:
@@ -169,7 +167,7 @@ def spread(
         scale * np.asarray(high - low, float) / 2
         for low, high in ((box.x_lower, box.x_upper), (box.u_lower, box.u_upper))
     )
-    model = getattr(problem.dynamics, "mj_model", None)
+    model = mujoco_model(problem.dynamics)
     du = half_u * _waves(rng, chains, K, nu)[:, :-1]
     if model is None:
         return _bounded(problem, x + half_x * _waves(rng, chains, K, nx)[:, 1:], u + du)
@@ -210,7 +208,7 @@ def _per_dof(model: mujoco.MjModel, widths: np.ndarray, turn: float) -> np.ndarr
 
 
 def _model(problem: Problem) -> mujoco.MjModel:
-    model = getattr(problem.dynamics, "mj_model", None)
+    model = mujoco_model(problem.dynamics)
     if model is None:
         raise DraxError(
             f"{problem.name} has no MuJoCo model, so it has no poses: give guess=Trajectory(x, u)."
@@ -244,47 +242,8 @@ def _through(problem: Problem, times: np.ndarray, qpos: np.ndarray) -> Trajector
     start = np.asarray(problem.x_init, float)
     act = np.broadcast_to(start[model.nq + model.nv :], (problem.horizon, model.na))
     states = np.concatenate([start[None], np.concatenate([q[1:], v, act], axis=1)])
-    return _bounded(problem, states[1:], controls(model, states, dt, middle(problem.bounds)))
-
-
-def controls(model: mujoco.MjModel, x: np.ndarray, dt: float, rest: np.ndarray) -> np.ndarray:
-    """What the C engine's inverse dynamics asks for between states x (K + 1, nx), (K, nu).
-
-    The least-squares answer nearest to rest, (nu,) or (K, nu), which stays where there is none.
-    """
-    model = copy.copy(model)  # forces without limits are affine in u
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-    model.actuator_forcelimited[:] = 0
-    data = mujoco.MjData(model)
-    out = np.broadcast_to(rest, (len(x) - 1, model.nu)).copy()
-    nq, nv = model.nq, model.nv
-    for k, u in enumerate(out):
-        set_state(model, data, x[k])
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        at_rest, above = (_forces(model, data, u + more) for more in (0.0, 1.0))
-        data.qacc[:] = (x[k + 1, nq : nq + nv] - x[k, nq : nq + nv]) / dt
-        mujoco.mj_inverse(model, data)
-        moment = moment_arms(model, data)
-        slope, lacking = moment.T * (above - at_rest), data.qfrc_inverse - moment.T @ at_rest
-        if np.isfinite(slope).all() and np.isfinite(lacking).all():
-            out[k] = u + np.linalg.lstsq(slope, lacking, rcond=None)[0]
-    return out
-
-
-def _forces(model: mujoco.MjModel, data: mujoco.MjData, u: np.ndarray) -> np.ndarray:
-    """Forces of the actuators (nu,) under u (nu,)."""
-    data.ctrl[:] = u
-    mujoco.mj_fwdActuation(model, data)
-    return data.actuator_force.copy()
-
-
-def middle(bounds: Box) -> np.ndarray:
-    """Middle of the control bounds, or 0 clipped to them where an end is infinite."""
-    low, high = (np.asarray(end, float) for end in (bounds.u_lower, bounds.u_upper))
-    with np.errstate(invalid="ignore"):
-        half = (low + high) / 2
-    return np.where(np.isfinite(half), half, np.clip(0.0, low, high))
+    u = inverse_dynamics(model, states, dt, middle_control(problem.bounds))
+    return _bounded(problem, states[1:], u)
 
 
 def _bounded(problem: Problem, x: np.ndarray, u: np.ndarray) -> Trajectory:

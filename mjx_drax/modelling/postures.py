@@ -8,24 +8,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.modelling.terms import Terms
-from mjx_drax.physics.agreement import Engine
-from mjx_drax.physics.mjcf import (
-    bounded_joints,
-    from_mjcf,
-    initial_state,
-    load,
-    model_name,
-    require_movable,
-    require_regular,
-    steps_between_knots,
-)
-from mjx_drax.physics.mjx_model import control_ranges, free_ranges
-from mjx_drax.physics.states import between
+from mjx_drax.physics.actuators import control_ranges
+from mjx_drax.physics.checks import checked_start
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.mjcf import from_mjcf, steps_between_knots
+from mjx_drax.physics.mjx_model import free_ranges
+from mjx_drax.physics.source import load, model_name
+from mjx_drax.physics.states import Engine, between
 from mjx_drax.problem.problem import Problem
 
 NEAR = 0.02
@@ -55,13 +48,10 @@ def reach(
     """
     model = load(source)
     name = name or model_name(model)
-    require_movable(model, name)
+    x_init, bounded = checked_start(model, name)
     steps = steps_between_knots(model, None)
-    dt = steps * model.opt.timestep
-    limits = control_ranges(model)
-    x_init = initial_state(model, name, None)
-    require_regular(model, name, x_init)
-    path = _motion(model, name, x_init, limits, steps, max(SHORTEST, round(horizon / dt)), seed)
+    dt, limits = steps * model.opt.timestep, control_ranges(model)
+    path = _motion(model, name, x_init, bounded, steps, max(SHORTEST, round(horizon / dt)), seed)
     target = path[-1, : model.nq]
     on = Terms(model)
     half = np.maximum(0.5 * (limits[1] - limits[0]), 1e-6)
@@ -84,14 +74,13 @@ def _motion(
     model: mujoco.MjModel,
     name: str,
     x_init: np.ndarray,
-    limits: tuple[np.ndarray, np.ndarray],
+    bounded: np.ndarray,
     steps: int,
     knots: int,
     seed: int,
 ) -> np.ndarray:
     """States (K + 1, nx), K <= knots, of the motion that stays in the joints' ranges longest."""
-    engine, rng = Engine(model), np.random.default_rng(seed)
-    bounded = bounded_joints(model, x_init)
+    engine, rng, limits = Engine(model), np.random.default_rng(seed), control_ranges(model)
     where = model.jnt_qposadr[bounded]
     lower, upper = (end[bounded] for end in free_ranges(model))
     best, rest = x_init[None], np.clip(0.0, *limits)

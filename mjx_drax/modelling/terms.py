@@ -22,13 +22,13 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.base.numbers import numbers as real_numbers
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.modelling.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.physics import quaternion
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.mjcf import index, load
-from mjx_drax.problem.dynamics import as_partial
-from mjx_drax.problem.problem import numbers as real_numbers
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.source import index, load
+from mjx_drax.problem.cost import as_partial
 
 Names = str | Iterable[str]
 

@@ -1,14 +1,20 @@
-"""One place that imports MJX, which would announce that warp is missing; nothing here needs it."""
+"""The one place that imports MJX, and that names what is not public in it.
+
+MJX announces that warp is missing when it is imported; nothing here needs it, so that is not shown.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
+from typing import Any
+
+from mjx_drax.physics.engine import mujoco as mujoco  # first: it says what is wrong if this fails
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     from mujoco import mjx as mjx
 
-    # What follows is not public: what MJX can collide, and how; frames of contacts
+    # Not public: what MJX can collide, and how; frames of contacts; the law of constraint forces
     from mujoco.mjx._src.collision_driver import (
         _COLLISION_FUNC as COLLISIONS,  # noqa: F401
     )
@@ -19,6 +25,14 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
         has_collision_fn as has_collision_fn,
     )
     from mujoco.mjx._src.math import make_frame as make_frame
-    from mujoco.mjx._src.solver import (
-        Context as Context,  # the law of constraint forces
-    )
+    from mujoco.mjx._src.solver import Context as ConstraintForces  # noqa: F401
+
+
+def internal(data: mjx.Data) -> Any:
+    """The arrays of `mjx.Data` that are not public: M, cinert, efc_J, contact, ..."""
+    return data._impl
+
+
+def with_internal(data: mjx.Data, **arrays: Any) -> mjx.Data:
+    """`data` with other arrays for some of those that are not public."""
+    return data.replace(_impl=data._impl.replace(**arrays))

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.physics._mjx import COLLISIONS, make_frame, mjx
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.engine import mujoco
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """Of a cube, (8, 3)."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax import Array
 
 from mjx_drax.physics import quaternion
+from mjx_drax.physics.engine import mujoco
 
 _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 

@@ -1,9 +1,9 @@
-"""The MJX twin of a MuJoCo model: what is planned with, beside the model that certifies.
+"""The MJX model that is made of a MuJoCo model: it plans what the MuJoCo model certifies.
 
-MJX computes the same physics from the same `mujoco.MjModel`, with exceptions. Some are mended on a
-copy, where an equal model exists that MJX knows (a solver, a flag, a disabled group). Some MJX
-refuses; the refusal is put in words. Some it computes differently without saying so; `differences`
-names those that a model has. What is left is for the certificate to find.
+MJX computes the same physics from the same `mujoco.MjModel`, with exceptions. Where an equal model
+exists that MJX supports (another solver, flag or group), it gets that one. What MJX refuses is said
+in an error, with the fix. Some things it computes differently without saying so: `differences`
+names those that a model has. All others are found by the certificate.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import jax
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, shown
-from mjx_drax.physics._mjx import geom_pairs, has_collision_fn
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.states import quiet
-from mjx_drax.physics.step import mjx
+from mjx_drax.physics._mjx import geom_pairs, has_collision_fn, internal, mjx
+from mjx_drax.physics.actuators import disabled, driven
+from mjx_drax.physics.engine import mujoco
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
@@ -27,15 +26,15 @@ _TOUCHED = (mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT)
 _NET_FORCE = 3
 """How contact sensors say reduce="netforce"."""
 
-NEAREST = 32
-"""Contact points of each friction dimension (condim) that a plan keeps, if it is not told how many:
-as many as eight boxes on the floor have. A step with half as many takes as long."""
+MOST_CONTACTS = 32
+"""Contact points of each friction dimension (condim) that a plan keeps by default: as many as eight
+boxes on the floor have. A step with half as many takes as long."""
 
 _LIMIT = "max_contact_points"
-"""The custom number of a model that MJX keeps so many contact points by."""
+"""The custom number of a model that tells MJX how many contact points to keep."""
 
 
-def twin(
+def put_model(
     model: mujoco.MjModel, contacts: bool | int = True, bounded: np.ndarray | None = None
 ) -> mjx.Model:
     """The MJX model of a MuJoCo model.
@@ -43,43 +42,43 @@ def twin(
     Args:
         model: which is not changed.
         contacts: False leaves contacts out; a number keeps so many contact points of each friction
-            dimension (condim), the nearest ones in every state; True keeps `NEAREST`.
-        bounded: joints whose limits the knots keep to, (njnt,). Inside them the limit's force is
-            zero, so its constraint row is left out; the C engine keeps it.
+            dimension (condim), the nearest ones in every state; True keeps `MOST_CONTACTS`.
+        bounded: joints whose ranges are bounds of the knots, (njnt,). Inside of its range the force
+            of a limit is zero, so its constraint row is left out; the C engine keeps it.
 
     Raises:
         DraxError: MJX does not support the model; says what and what to do.
     """
     if contacts is not True and not (isinstance(contacts, int | np.integer) and contacts >= 0):
         raise DraxError(f"contacts is {shown(contacts)}: give True, False or a whole number.")
-    mended = copy.deepcopy(model)
+    supported = copy.deepcopy(model)
     if bounded is not None:
-        mended.jnt_limited[bounded] = 0
+        supported.jnt_limited[bounded] = 0
     if not contacts:
-        mended.opt.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
-    _mend(mended)
+        supported.opt.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
+    _make_supported(supported)
     try:
-        on_device = mjx.put_model(mended, device=jax.local_devices()[0], impl="jax")
-        on_device = _with_nearest(on_device, contacts)
+        on_device = mjx.put_model(supported, device=jax.local_devices()[0], impl="jax")
+        on_device = _with_contact_limit(on_device, contacts)
     except (NotImplementedError, ValueError) as error:
-        raise DraxError(_refusal(mended, str(error))) from error
-    if not model.nmat:  # MJX's rangefinders look up materials, whether there are any or not
+        raise DraxError(_refusal(supported, str(error))) from error
+    if not model.nmat:  # MJX's rangefinders read materials, also where there are none
         on_device = on_device.replace(mat_rgba=np.ones((1, 4), np.float32))
-    # MJX commits its arrays to a device. What is computed from them is then committed as well, and
-    # a loop that is fed its own output would be compiled a second time. (`asarray` would compile a
-    # program for every shape.)
+    # MJX commits its arrays to a device, and so all that is computed from them. A loop that gets
+    # its own output would then be compiled a second time, so they are put there uncommitted.
+    # (`jnp.asarray` would compile a program for every shape.)
     placed: mjx.Model = jax.device_put(_with_springs(jax.tree.map(np.asarray, on_device)))
     return placed
 
 
-def _with_nearest(model: mjx.Model, contacts: bool | int) -> mjx.Model:
-    """The model with no more than the nearest contact points, where it has more.
+def _with_contact_limit(model: mjx.Model, contacts: bool | int) -> mjx.Model:
+    """The model, told to keep only the nearest contact points if it has more than it should.
 
     MJX reads how many to keep from a custom number of the model. It is added here, not in the MJCF,
-    because a model may come compiled. MJX's other number, `max_geom_pairs`, is left alone: it
-    chooses pairs by spheres about them before it knows distances, and so loses contacts.
+    because a model may come compiled. MJX's other number, `max_geom_pairs`, is not used: MJX then
+    chooses pairs of geoms by their bounding spheres, before it knows distances, and loses contacts.
     """
-    points = NEAREST if contacts is True else int(contacts)
+    points = MOST_CONTACTS if contacts is True else int(contacts)
     if np.bincount(contact_points(model), minlength=1).max() <= points:
         return model
     return model.replace(
@@ -93,21 +92,21 @@ def _with_nearest(model: mjx.Model, contacts: bool | int) -> mjx.Model:
 
 
 def _with_springs(model: mjx.Model) -> mjx.Model:
-    """The model, whose tendon springs have a derivative at rest too.
+    """The model, whose tendon springs have a derivative at their rest length too.
 
     MJX finds no force in a tendon that is neither longer nor shorter than its spring, and so no
-    stiffness either. Now it is longer, by the last digit.
+    stiffness either. The rest length is made shorter by the last digit.
     """
     lower, upper = model.tendon_lengthspring.T
     upper = np.where(lower == upper, np.nextafter(upper, upper.dtype.type(-np.inf)), upper)
     return model.replace(tendon_lengthspring=np.stack([lower, upper], axis=1))
 
 
-def _mend(model: mujoco.MjModel) -> None:
-    """Change a model into one that MJX knows, with the same motions (or nearly: `differences`)."""
+def _make_supported(model: mujoco.MjModel) -> None:
+    """Change a model into one that MJX supports and that moves alike, up to `differences`."""
     opt = model.opt
-    opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # M as `physics` has it
-    opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all find the same minimum
+    opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # the inertia as `tree` computes it
+    opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all solvers find the same minimum
     if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
         opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
@@ -119,31 +118,23 @@ def _mend(model: mujoco.MjModel) -> None:
         model.dof_damping[:] = 0.0
         model.tendon_damping[:] = 0.0
     if not (opt.disableflags & springs and opt.disableflags & dampers):
-        # With one of the two flags set, MJX leaves out all passive forces; MuJoCo, with both
+        # MJX leaves out all passive forces where one of the two flags is set, MuJoCo where both are
         opt.disableflags &= ~(springs | dampers)
     if opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
-        # Otherwise MJX refuses what it cannot collide
+        # Otherwise MJX refuses geoms that it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
     touching = next(geom_pairs(model), None) is not None
     if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
-        # Nothing has a friction cone, and MJX fails where there are no elliptic ones
+        # No contact has friction, and MJX fails if elliptic cones are asked for and there are none
         opt.cone = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
-    if not touching:  # MJX looks for contacts, and finds no array of them
+    if not touching:  # MJX fails in these sensors, because there is no array of contacts
         touch = np.isin(model.sensor_type, [int(kind) for kind in _TOUCHED])
         model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
     model.actuator_gainprm[disabled(model)] = 0.0
     model.actuator_biasprm[disabled(model)] = 0.0
-    # `differences` names them
+    # These sensors are named in `differences`
     model.sensor_type[_unknown_sensors(model)] = int(mujoco.mjtSensor.mjSENS_CLOCK)
-
-
-def disabled(model: mujoco.MjModel) -> np.ndarray:
-    """Actuators that are switched off, by their group or all, (nu,)."""
-    if model.opt.disableflags & _DISABLE.mjDSBL_ACTUATION:
-        return np.ones(model.nu, bool)
-    groups, off = model.actuator_group, int(model.opt.disableactuator)
-    return np.array([0 <= g < 31 and bool(off >> int(g) & 1) for g in groups], bool)
 
 
 def _unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
@@ -247,7 +238,7 @@ def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
             yield a, b
 
 
-_ROUGH = {
+_OTHER_CONTACTS = {
     frozenset(kinds)
     for kinds in (
         (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH),
@@ -274,7 +265,7 @@ _ROUGH = {
 def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]:
     """What MJX computes differently from the C engine in this model, a sentence each.
 
-    Found by comparing one step of both over many models: each moved velocities by 2e-5 to 0.7.
+    Found by comparing one step of both in many models: each changed velocities by 2e-5 to 0.7.
     """
     opt, found = model.opt, []
 
@@ -318,7 +309,7 @@ def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]
     if contacts:
         for a, b in contact_pairs(model):
             kinds = frozenset((_GEOM(model.geom_type[a]), _GEOM(model.geom_type[b])))
-            if kinds in _ROUGH:
+            if kinds in _OTHER_CONTACTS:
                 found.append(
                     f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
                     "differ: use spheres, capsules and planes"
@@ -327,60 +318,18 @@ def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]
     return found
 
 
-def moment_arms(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Moment arms (nu, nv): generalized forces are their transpose times the actuators' forces."""
-    moment, at = np.zeros((model.nu, model.nv)), (data.moment_rownnz, data.moment_rowadr)
-    mujoco.mju_sparse2dense(moment, data.actuator_moment, *at, data.moment_colind)
-    return moment
-
-
-def moments(model: mujoco.MjModel) -> np.ndarray:
-    """Of a unit of every actuator's force, the largest force on every velocity, (nu, nv).
-
-    Over the default pose and two random ones, because what pulls at what depends on the pose.
-    """
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    largest = np.zeros((model.nu, model.nv))
-    for _ in range(3):
-        with quiet():
-            mujoco.mj_forward(model, data)
-        largest = np.maximum(largest, np.abs(moment_arms(model, data)))
-        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
-    largest[disabled(model)] = 0.0
-    return largest
-
-
-def driven(model: mujoco.MjModel) -> np.ndarray:
-    """Joints that an actuator pulls at in the default pose or another, (njnt,)."""
-    joints = np.zeros(model.njnt, bool)
-    joints[model.dof_jntid[moments(model).sum(axis=0) > 0]] = True
-    return joints
-
-
-def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
-    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
-
-
-def control_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of controls, (nu,) each: the model's, or +-1 where it has none."""
-    limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    lower, upper = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
-    return lower, upper
-
-
 def constraint_rows(model: mjx.Model) -> int:
     """Rows that constraint forces are solved for in a step, whether they are active or not."""
-    return int(jax.eval_shape(mjx.make_data, model)._impl.efc_J.shape[0])
+    return int(internal(_data_of(model)).efc_J.shape[0])
 
 
 def contact_points(model: mjx.Model) -> np.ndarray:
     """Friction dimensions (condim) of the contact points in a step, (n,), active or not."""
-    return np.asarray(jax.eval_shape(mjx.make_data, model)._impl.contact.dim, int)
+    return np.asarray(internal(_data_of(model)).contact.dim, int)
 
 
-def nearest_only(model: mjx.Model) -> int | None:
-    """Of how many contact points of a friction dimension a step knows the forces; None: of all."""
+def kept_contacts(model: mjx.Model) -> int | None:
+    """How many contact points of each friction dimension a step keeps; None if it keeps all."""
     i = mjx.name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _LIMIT)
     return int(model.numeric_data[i]) if i >= 0 and model.numeric_data[i] >= 0 else None
 
@@ -388,3 +337,26 @@ def nearest_only(model: mjx.Model) -> int | None:
 def has_constraints(model: mjx.Model) -> bool:
     """Whether a step of the model solves for constraint forces."""
     return constraint_rows(model) > 0
+
+
+def _data_of(model: mjx.Model) -> mjx.Data:
+    """The data of a model: shapes, and what depends on no state."""
+    return jax.eval_shape(mjx.make_data, model)
+
+
+def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of joint ranges, within which no limit's force acts, (njnt,) each."""
+    return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
+
+
+def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
+    """Joints whose range becomes a bound on knots, (njnt,).
+
+    Those are hinges and slides that an actuator drives and that start inside their range. What
+    rests on its limit, or starts beyond it, needs the limit's force: it stays in the dynamics.
+    """
+    kinds = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+    single = np.isin(model.jnt_type, [int(kind) for kind in kinds]) & (model.jnt_limited != 0)
+    start = x_init[model.jnt_qposadr]
+    lower, upper = free_ranges(model)
+    return single & driven(model) & (start > lower) & (start < upper)

@@ -1,6 +1,6 @@
-"""Where a model came from, as MJCF that can be written again, with the files it needs.
+"""MuJoCo models from files and texts, their parts by name, and their MJCF for writing it again.
 
-MuJoCo writes the numbers of a model with six digits.
+MuJoCo itself writes the numbers of a model with six digits.
 """
 
 from __future__ import annotations
@@ -11,10 +11,141 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from mjx_drax.base.errors import DraxError
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.base.errors import DraxError, cut, shown
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.states import quiet
 
 _FOLDER_OF = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
+
+_FIXES = {
+    "'mujocoinclude'": "It is a part that models include: give the model's own file.",
+    "Unrecognized XML model type": "Give an MJCF, which begins with <mujoco>, or a URDF.",
+    "Error opening file": "Put that file there, or correct the path, meshdir or texturedir.",
+}
+"""What to do about some of MuJoCo's error messages."""
+
+_GIVEN = ("body_", "dof_", "jnt_", "geom_", "tendon_", "actuator_", "eq_", "qpos_spring", "key_")
+"""How the names of arrays begin that hold what the MJCF says; names ending in 0 are computed."""
+
+_COUNTS = {
+    "joint": "njnt",
+    "site": "nsite",
+    "body": "nbody",
+    "geom": "ngeom",
+    "actuator": "nu",
+    "sensor": "nsensor",
+    "keyframe": "nkey",
+}
+
+
+def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
+    """A model from a file, an XML string or a `mujoco.MjModel`.
+
+    Raises:
+        DraxError: the file is missing, MuJoCo cannot compile it, or it holds NaN.
+    """
+    model = source if isinstance(source, mujoco.MjModel) else _compiled(source)
+    _require_finite(model)
+    return model
+
+
+def _compiled(source: str | Path) -> mujoco.MjModel:
+    try:
+        with quiet():
+            if is_xml(source):
+                return mujoco.MjModel.from_xml_string(source)
+            if not Path(source).is_file():
+                is_folder = Path(source).is_dir()
+                what = "it is a folder; give a file in it" if is_folder else "check the path"
+                raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
+            if is_binary(source):
+                return mujoco.MjModel.from_binary_path(str(source))
+            return mujoco.MjModel.from_xml_path(str(source))
+    except DraxError:
+        raise
+    except TypeError as error:
+        raise DraxError(
+            f"the model is {shown(source)}: give an MJCF file, its XML as a text, or a "
+            "mujoco.MjModel."
+        ) from error
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        words = " ".join(str(error).split())
+        fix = next((fix for part, fix in _FIXES.items() if part in words), "Correct the MJCF.")
+        raise DraxError(
+            f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} {fix}"
+        ) from error
+
+
+def _require_finite(model: mujoco.MjModel) -> None:
+    """Complain about NaN and infinite numbers in a model; MuJoCo itself only warns of them."""
+    if not (np.isfinite(model.opt.timestep) and model.opt.timestep > 0):
+        raise DraxError(
+            f"the timestep of {model_name(model)} is {model.opt.timestep} s: give a positive one, "
+            '<option timestep="0.01"/>.'
+        )
+    options = {f"opt.{name}": getattr(model.opt, name) for name in dir(model.opt)}
+    given = [name for name in dir(model) if name.startswith(_GIVEN) and not name.endswith("0")]
+    for name, value in {**options, **{name: getattr(model, name) for name in given}}.items():
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            # The ranges of a model may be infinite, its options not
+            wrong = value[~np.isfinite(value) if name in options else np.isnan(value)]
+            if wrong.size:
+                raise DraxError(
+                    f"{name} of {model_name(model)} holds {wrong[0]}: give finite numbers in the "
+                    "MJCF."
+                )
+
+
+def model_name(model: mujoco.MjModel) -> str:
+    """What the model calls itself."""
+    return model.names[: model.names.index(b"\0")].decode() or "model"
+
+
+def index(model: mujoco.MjModel, kind: str, name: str) -> int:
+    """Number of an element of a model: a joint, site, body, geom, actuator, sensor or keyframe.
+
+    Raises:
+        DraxError: there is none of that name; lists those that there are.
+    """
+    element = getattr(model, "key" if kind == "keyframe" else kind)
+    names = [element(i).name for i in range(getattr(model, _COUNTS[kind]))]
+    if not isinstance(name, str) or not name or name not in names:
+        known = ", ".join(repr(n) for n in names if n) or "no named one; add one"
+        raise DraxError(f"{model_name(model)} has no {kind} {shown(name)}: there is {known}.")
+    return names.index(name)
+
+
+def is_xml(given: object) -> bool:
+    """Whether a model is given as its XML, not as the path of a file."""
+    return isinstance(given, str) and given.lstrip().startswith("<")
+
+
+def is_binary(given: object) -> bool:
+    """Whether a model is given as the path of a file that MuJoCo has compiled, .mjb."""
+    return not is_xml(given) and Path(str(given)).suffix.lower() == ".mjb"
+
+
+def origin_of(given: str | Path | mujoco.MjModel) -> str | Path | None:
+    """The MJCF that a model is given as: its XML, or its file's absolute path; or None."""
+    if isinstance(given, mujoco.MjModel) or is_binary(given):
+        return None
+    return given if is_xml(given) else Path(given).resolve()
+
+
+def binary(model: mujoco.MjModel) -> bytes:
+    """The compiled model, as only the same version of MuJoCo reads it."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def from_binary(content: bytes) -> mujoco.MjModel:
+    """The model that `binary` gave.
+
+    Raises:
+        ValueError: another version of MuJoCo wrote it.
+    """
+    return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": content})
 
 
 @dataclass(frozen=True)
@@ -73,32 +204,6 @@ class Source:
             ValueError: MuJoCo cannot compile it.
         """
         return mujoco.MjModel.from_xml_string(self.xml, dict(self.assets))
-
-
-def is_xml(given: object) -> bool:
-    """Whether a model is given as its XML, not as the path of a file."""
-    return isinstance(given, str) and given.lstrip().startswith("<")
-
-
-def is_binary(given: object) -> bool:
-    """Whether a model is given as the path of a file that MuJoCo has compiled, .mjb."""
-    return not is_xml(given) and Path(str(given)).suffix.lower() == ".mjb"
-
-
-def binary(model: mujoco.MjModel) -> bytes:
-    """The compiled model, as only the same version of MuJoCo reads it."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
-
-
-def from_binary(content: bytes) -> mujoco.MjModel:
-    """The model that `binary` gave.
-
-    Raises:
-        ValueError: another version of MuJoCo wrote it.
-    """
-    return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": content})
 
 
 def _free_name(name: str, content: bytes, taken: dict[str, bytes]) -> str:

@@ -1,4 +1,4 @@
-"""States of a model on the host, in float64, by MuJoCo's own functions.
+"""States of a model in float64, by MuJoCo's own functions, and single steps of its C engine.
 
 x = [qpos (nq), qvel (nv), act (na)]; tangent vectors are [dq (nv), dv (nv), da (na)], and dq turns
 quaternions in their own frame. `joints` is the same arithmetic in JAX.
@@ -7,19 +7,20 @@ quaternions in their own frame. `joints` is the same arithmetic in JAX.
 from __future__ import annotations
 
 import contextlib
+import copy
 from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.engine import mujoco
 
 Floats = npt.NDArray[np.floating]
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep MuJoCo from printing warnings, and from writing MUJOCO_LOG.TXT where the user stands."""
+    """Keep MuJoCo from printing warnings, and from writing MUJOCO_LOG.TXT into the folder."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -46,7 +47,7 @@ def between(model: mujoco.MjModel, one: Floats, other: Floats) -> Floats:
 
 
 def moved(model: mujoco.MjModel, qpos: Floats, dq: Floats, by: float = 1.0) -> Floats:
-    """The position (nq,) reached from qpos along the tangent vector dq (nv,), a multiple of it."""
+    """The position (nq,) reached from qpos along by * dq, a tangent vector (nv,)."""
     out = np.array(qpos, float)
     mujoco.mj_integratePos(model, out, dq, by)
     return out
@@ -69,7 +70,7 @@ def integrate(model: mujoco.MjModel, x: Floats, dx: Floats) -> Floats:
 def interpolated(model: mujoco.MjModel, qpos: Floats, times: Floats, time: float) -> Floats:
     """Position (nq,) at a time [s], at constant velocity between qpos (T, nq) at rising times (T,).
 
-    Before the first time and after the last it is held.
+    Before the first time it is the first position, after the last time the last.
     """
     time = float(np.clip(time, times[0], times[-1]))
     last = int(np.searchsorted(times, time, side="right")) - 1
@@ -77,3 +78,48 @@ def interpolated(model: mujoco.MjModel, qpos: Floats, times: Floats, time: float
         return qpos[last]
     share = (time - times[last]) / (times[last + 1] - times[last])
     return moved(model, qpos[last], between(model, qpos[last], qpos[last + 1]), share)
+
+
+class Engine:
+    """Single steps of the C engine, with constraints solved to rounding."""
+
+    def __init__(self, model: mujoco.MjModel, contacts: bool | int = True) -> None:
+        self.model = copy.deepcopy(model)
+        self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
+        self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        if not contacts:
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+
+    def step(self, x: Floats, u: Floats, steps: int = 1) -> Floats:
+        """The state (nx,) some steps after x (nx,) under u (nu,)."""
+        data = mujoco.MjData(self.model)
+        set_state(self.model, data, x)
+        data.ctrl[:] = u
+        with quiet():
+            mujoco.mj_step(self.model, data, steps)
+        return np.concatenate([data.qpos, data.qvel, data.act])
+
+    def active_contacts(self, x: Floats) -> int:
+        """Contacts that act at x (nx,), of the friction dimension that has the most."""
+        data = mujoco.MjData(self.model)
+        set_state(self.model, data, x)
+        with quiet():
+            mujoco.mj_forward(self.model, data)
+        acting = data.contact.dim[data.contact.efc_address >= 0]
+        return int(np.bincount(acting, minlength=1).max())
+
+    def jacobian(self, x: Floats, u: Floats, eps: float = 1e-6) -> Floats:
+        """[df/dx df/du] (ndx, ndx + nu) by central differences in tangent space."""
+        return self.slopes(x, u, eps).mean(axis=0)
+
+    def slopes(self, x: Floats, u: Floats, eps: float = 1e-6) -> Floats:
+        """The same by differences to either side, (2, ndx, ndx + nu)."""
+        reached, ndx = self.step(x, u), 2 * self.model.nv + self.model.na
+
+        def change(dz: Floats) -> Floats:
+            end = self.step(integrate(self.model, x, dz[:ndx]), u + dz[ndx:])
+            return difference(self.model, end, reached)
+
+        units = eps * np.eye(ndx + self.model.nu)
+        sides = [[sign * change(sign * e) / eps for e in units] for sign in (1.0, -1.0)]
+        return np.swapaxes(sides, 1, 2)

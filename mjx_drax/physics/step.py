@@ -27,10 +27,9 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.kernels.linalg import cholesky, solve, symmetric
-from mjx_drax.physics._mjx import Context
-from mjx_drax.physics._mjx import mjx as mjx
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
 from mjx_drax.physics.collision import collision
+from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
 
@@ -85,11 +84,10 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.fwd_velocity`, without its walks along the tree."""
-    data = data.tree_replace(
-        {
-            "_impl.actuator_velocity": data._impl.actuator_moment @ data.qvel,
-            "_impl.ten_velocity": data._impl.ten_J @ data.qvel,
-        }
+    data = with_internal(
+        data,
+        actuator_velocity=internal(data).actuator_moment @ data.qvel,
+        ten_velocity=internal(data).ten_J @ data.qvel,
     )
     data = rne(model, mjx.passive(model, com_vel(model, data)))
     return mjx.tendon_bias(model, data)
@@ -99,7 +97,7 @@ def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.fwd_acceleration`: `data` with the acceleration that constraints do not change."""
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
     force = force + data.qfrc_applied + mjx.xfrc_accumulate(model, data)
-    qacc = solve(cholesky(data._impl.M), force)
+    qacc = solve(cholesky(internal(data).M), force)
     return data.replace(qfrc_smooth=force, qacc_smooth=qacc)
 
 
@@ -112,12 +110,12 @@ def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
 
 def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`data` with the acceleration and forces that constraints leave."""
-    if data._impl.efc_J.size == 0:
+    if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
 
-    def law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Context]:
+    def law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, ConstraintForces]:
         """The slope of what the acceleration minimizes, (nv,), and constraint forces."""
-        forces = Context.create(model, data.replace(qacc=qacc), grad=False)
+        forces = ConstraintForces.create(model, data.replace(qacc=qacc), grad=False)
         return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
     given = model, data
@@ -129,15 +127,14 @@ def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     found = _minimum(partial(law, *frozen), hessian, frozen[1].qacc_smooth)
     qacc = found - solve(cholesky(hessian(found)), law(*given, found)[0])
     _, forces = law(*given, qacc)
-    return data.replace(
-        qacc=qacc,
-        qfrc_constraint=forces.Ma - data.qfrc_smooth,
-        _impl=data._impl.replace(efc_force=forces.efc_force),
-    )
+    data = data.replace(qacc=qacc, qfrc_constraint=forces.Ma - data.qfrc_smooth)
+    return with_internal(data, efc_force=forces.efc_force)
 
 
 def _minimum(
-    law: Callable[[Array], tuple[Array, Context]], hessian: Callable[[Array], Array], start: Array
+    law: Callable[[Array], tuple[Array, ConstraintForces]],
+    hessian: Callable[[Array], Array],
+    start: Array,
 ) -> Array:
     """The acceleration (nv,) where the slope of `law` is zero, to rounding, by Newton's method.
 
@@ -187,7 +184,7 @@ def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
         fall = mjx.deriv_smooth_vel(model, data)
         if fall is None:
             return data.qacc
-    M = symmetric(data._impl.M - h * fall)
+    M = symmetric(internal(data).M - h * fall)
     return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
 
 

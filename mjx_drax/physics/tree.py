@@ -24,8 +24,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from mjx_drax.physics._mjx import mjx
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics._mjx import internal, mjx, with_internal
+from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.quaternion import matrix, multiply, normalized
 
@@ -146,7 +146,7 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     swept = jnp.cross(axes, about[body] - data.xanchor[joint])
     turning = jnp.where(moves[:, None], 0.0, axes)
     cdof = jnp.concatenate([turning, jnp.where(moves[:, None], axes, swept)], axis=1)
-    return data.tree_replace({"subtree_com": com, "_impl.cinert": cinert, "cdof": cdof})
+    return with_internal(data.replace(subtree_com=com, cdof=cdof), cinert=cinert)
 
 
 def mass_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -156,11 +156,11 @@ def mass_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     inertia of all of that.
     """
     sums = _Sums.of(model)
-    moved = _inertia_times(_summed(sums.moves.T, data._impl.cinert), data.cdof)
+    moved = _inertia_times(_summed(sums.moves.T, internal(data).cinert), data.cdof)
     products = jnp.sum(moved[:, None] * data.cdof, axis=2)
     below = jnp.where(np.tril(sums.moves[model.dof_bodyid]) > 0, products, 0.0)
     M = below + jnp.tril(below, -1).T + jnp.diag(model.dof_armature)
-    return data.tree_replace({"_impl.M": M})
+    return with_internal(data, M=M)
 
 
 def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -174,7 +174,7 @@ def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.rne`: `data` with the forces qfrc_bias (nv,) of gravity and velocities."""
-    moves, inertia = _Sums.of(model).moves, data._impl.cinert
+    moves, inertia = _Sums.of(model).moves, internal(data).cinert
     acceleration = _summed(moves, data.cdof_dot * data.qvel[:, None])
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         acceleration = acceleration - jnp.concatenate([jnp.zeros(3), model.opt.gravity])

@@ -1,14 +1,12 @@
 """Guesses from poses and paths: positions, velocities, controls, and batches of them."""
 
-from types import SimpleNamespace
-
 import jax
 import mujoco
 import numpy as np
 import pytest
 
 from mjx_drax import DraxError, from_function, from_mjcf, guesses
-from mjx_drax.problem.problem import box
+from mjx_drax.physics.actuators import inverse_dynamics
 from mjx_drax.search.restarts import initial_knots
 
 ARM = """
@@ -43,23 +41,23 @@ LOW, HIGH, BACK = np.array([[-0.4, 0], [0.2, 3], [0, -1.0]])
 
 
 def turning():
-    """A problem in all that guesses read, for a model with a free and a ball joint."""
-    model = mujoco.MjModel.from_xml_string("""
-    <mujoco><worldbody>
+    """A model with a free and a ball joint."""
+    xml = """
+    <mujoco model="turning"><worldbody>
       <body><joint type="slide" range="-1 1" limited="true"/><geom size="0.1"/></body>
       <body><freejoint/><geom size="0.1 0.2 0.3" type="box"/>
         <body pos="1 0 0"><joint name="ball" type="ball"/><geom size="0.1" pos="0.1 0 0"/></body>
       </body></worldbody>
-      <actuator><motor joint="ball" gear="1 0 0"/></actuator></mujoco>""")
-    nx = model.nq + model.nv
-    return SimpleNamespace(
-        dynamics=SimpleNamespace(mj_model=model, nx=nx, nu=1, dt=0.1),
-        x_init=np.concatenate([model.qpos0, np.zeros(model.nv)]),
-        bounds=box(nx, 1, ([-1] + [-np.inf] * (nx - 1), [1] + [np.inf] * (nx - 1)), (-1, 1)),
-        scatter=box(nx, 1, (-2, 2), (-1, 1)),
-        horizon=10,
-        times=0.1 * np.arange(11),
-        name="turning",
+      <actuator><motor joint="ball" gear="1 0 0"/></actuator></mujoco>"""
+    return from_mjcf(
+        xml,
+        horizon=1.0,
+        dt=0.1,
+        running_residual=lambda data, u: u,
+        x_bounds=([-1] + [-np.inf] * 21, [1] + [np.inf] * 21),
+        u_bounds=(-1, 1),
+        x_scatter=(-2, 2),
+        contacts=False,
     )
 
 
@@ -117,7 +115,7 @@ def test_controls_are_those_that_drive_the_engine_along_the_path():
         mujoco.mj_step(model, data)
         states[k + 1] = np.concatenate([data.qpos, data.qvel])
     model.actuator_forcelimited[1] = 1
-    found = guesses.controls(model, states, 0.01, np.zeros(2))
+    found = inverse_dynamics(model, states, 0.01, np.zeros(2))
     close(found, applied, 1e-6)
     assert model.actuator_forcelimited[1]  # a copy was unlimited
     # The same through a problem, whose velocities are the differences of the path's positions.
@@ -138,7 +136,7 @@ def test_controls_without_an_answer_are_the_middle_of_their_bounds():
     assert np.isfinite(guess.x).all()
     nowhere = np.full((3, 4), np.nan)
     close(
-        guesses.controls(PROBLEM.dynamics.mj_model, nowhere, 0.01, np.array([1, 2.0])), [[1, 2]] * 2
+        inverse_dynamics(PROBLEM.dynamics.mj_model, nowhere, 0.01, np.array([1, 2.0])), [[1, 2]] * 2
     )
 
 

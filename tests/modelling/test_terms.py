@@ -13,7 +13,7 @@ from mujoco import mjx
 from mjx_drax import DraxError, Terms, from_mjcf
 from mjx_drax.modelling.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.models import path
-from mjx_drax.problem.dynamics import as_partial
+from mjx_drax.problem.cost import as_partial
 
 ROBOT = """
 <mujoco model="robot">

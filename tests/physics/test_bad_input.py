@@ -7,7 +7,7 @@ import pytest
 from builders import BALL, INF, NAN, At, arm, assert_complains, cases, robot
 
 from mjx_drax import Smoothed, from_mjcf, solve
-from mjx_drax.physics.check import check
+from mjx_drax.physics.report import check
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_drax.physics._mjx import COLLISIONS, mjx
 from mjx_drax.physics.collision import CORNERS, collision, plane_box
-from mjx_drax.physics.mjx_model import twin
+from mjx_drax.physics.mjx_model import put_model
 
 BOX = """
 <mujoco>
@@ -22,7 +22,7 @@ def test_a_box_stands_on_the_corners_that_the_c_engine_has():
     model = mujoco.MjModel.from_xml_string(BOX)
     wanted, rng, counts = mujoco.MjData(model), np.random.default_rng(0), set()
     with jax.enable_x64(True):
-        on_device = twin(model)
+        on_device = put_model(model)
         data = mjx.make_data(on_device)
         find = jax.jit(
             lambda pos, mat: (

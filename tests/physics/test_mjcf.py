@@ -14,7 +14,7 @@ from mjx_drax.method.langevin import evaluate
 from mjx_drax.method.linearize import linearize
 from mjx_drax.models import path
 from mjx_drax.physics import step as physics
-from mjx_drax.physics.check import check
+from mjx_drax.physics.report import check
 from mjx_drax.physics.states import difference, set_state
 from mjx_drax.problem.differentiators import Autodiff
 
@@ -340,9 +340,10 @@ def test_what_mjx_fails_in_is_refused(monkeypatch):
 
     monkeypatch.setattr(physics.mjx, "sensor_acc", missing)
     words = r"MJX fails in a step of arm \(TypeError: no gather\): leave out sensors"
+    model = arm(joint='damping="0.0123"')  # one that has not been traced before
     with pytest.raises(DraxError, match=words):
-        problem(arm(joint='damping="0.0123"'))
-    assert re.match(words, check(arm())["obstacle"])
+        problem(model)
+    assert re.match(words, check(model)["obstacle"])
 
 
 @pytest.mark.parametrize("side", [0, 1])

@@ -10,18 +10,19 @@ import pytest
 
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.physics.agreement import Engine, Probes, compare
+from mjx_drax.physics.actuators import driven
+from mjx_drax.physics.checks import Samples, compare
 from mjx_drax.physics.mjx_model import (
-    NEAREST,
+    MOST_CONTACTS,
     constraint_rows,
     contact_pairs,
     contact_points,
     differences,
-    driven,
     has_constraints,
-    nearest_only,
-    twin,
+    kept_contacts,
+    put_model,
 )
+from mjx_drax.physics.states import Engine
 from mjx_drax.physics.step import step
 
 CHAIN = """
@@ -61,7 +62,7 @@ def rigid(**parts):
     return chain(**({"flag": 'contact="disable"'} | parts))
 
 
-STATES = Probes(
+STATES = Samples(
     np.array([[0.3, -0.2, 1.0, -0.5], [0.0, 0.0, 0.0, 0.0]]), np.array([[0.5, 1.0]] * 2)
 )
 
@@ -86,28 +87,28 @@ def test_what_is_mended_steps_like_the_c_engine(parts):
 
 def test_implicit_becomes_implicitfast_and_is_named():
     model = rigid(option='integrator="implicit"')
-    assert twin(model).opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert put_model(model).opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert any('"implicit" is planned with' in sentence for sentence in differences(model))
 
 
 def test_the_model_is_left_as_it_was():
     model = rigid(option='solver="PGS" actuatorgroupdisable="1"', flag='spring="disable"')
     before = (model.opt.solver, model.opt.disableflags, model.jnt_stiffness[0])
-    twin(model, contacts=False, bounded=np.ones(2, bool))
+    put_model(model, contacts=False, bounded=np.ones(2, bool))
     assert (model.opt.solver, model.opt.disableflags, model.jnt_stiffness[0]) == before
     assert np.all(model.actuator_gainprm[:, 0] == 1)
 
 
 def test_limits_that_are_bounds_leave_the_dynamics():
     model = rigid(joint='range="-1 1" limited="true"')
-    assert has_constraints(twin(model))
-    assert not has_constraints(twin(model, bounded=np.array([True, False])))
+    assert has_constraints(put_model(model))
+    assert not has_constraints(put_model(model, bounded=np.array([True, False])))
 
 
 @pytest.mark.slow
 def test_at_a_limit_derivatives_are_those_to_one_side():
     model = rigid(joint='range="-1 0" limited="true"')
-    at_limit = Probes(np.zeros((1, 4)), np.zeros((1, 2)))
+    at_limit = Samples(np.zeros((1, 4)), np.zeros((1, 2)))
     ahead, behind = Engine(model).slopes(at_limit.x[0], at_limit.u[0])
     assert np.abs(ahead - behind).max() > 0.1
     assert compare(model, at_limit, derivatives=True).jacobian < 1e-4
@@ -117,7 +118,7 @@ def test_at_a_limit_derivatives_are_those_to_one_side():
 def test_tendon_springs_have_stiffness_at_rest():
     rope = '<tendon><spatial stiffness="2"><site site="tip"/><site site="wall"/></spatial></tendon>'
     model = rigid(before='<worldbody><site name="wall" pos="1 0 0"/></worldbody>', more=rope)
-    rest = Probes(np.zeros((1, 4)), np.zeros((1, 2)))
+    rest = Samples(np.zeros((1, 4)), np.zeros((1, 2)))
     found = compare(model, rest, derivatives=True)
     assert found.velocity[0] < 1e-12
     assert found.jacobian < 1e-7
@@ -177,14 +178,14 @@ APART = {"links": 'contype="0" conaffinity="0"'}
 )
 def test_what_is_refused_says_why_and_what_to_do(parts, words):
     with pytest.raises(DraxError, match=words):
-        twin(chain(**parts))
+        put_model(chain(**parts))
 
 
 def test_contacts_that_mjx_cannot_make_can_be_left_out():
     model = chain(floor="box", floors='pos="0 0 -1"', link="ellipsoid")
-    assert not has_constraints(twin(model, contacts=False))
+    assert not has_constraints(put_model(model, contacts=False))
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    assert not has_constraints(twin(model))
+    assert not has_constraints(put_model(model))
 
 
 def test_a_plan_keeps_the_nearest_contacts_of_a_model_that_has_many():
@@ -196,28 +197,28 @@ def test_a_plan_keeps_the_nearest_contacts_of_a_model_that_has_many():
     custom = '<custom><numeric name="pair" data="1 2"/></custom>'
     floor = '<contact><pair geom1="floor" geom2="ball" condim="1"/></contact>'
     model = chain(before=f"{custom}<worldbody>{balls}</worldbody>", more=floor)
-    found = [twin(model, number) for number in (10_000, True, 2, 1)]
+    found = [put_model(model, number) for number in (10_000, True, 2, 1)]
     few = [np.bincount(contact_points(t))[[1, 3]].tolist() for t in found]
-    assert few == [[1, few[0][1]], [1, NEAREST], [1, 2], [1, 1]]
+    assert few == [[1, few[0][1]], [1, MOST_CONTACTS], [1, 2], [1, 1]]
     assert few[0][1] > 666
-    assert [nearest_only(t) for t in found] == [None, NEAREST, 2, 1]
-    assert [constraint_rows(t) for t in found[1:]] == [1 + 4 * n for n in (NEAREST, 2, 1)]
-    assert not has_constraints(twin(model, 0))
+    assert [kept_contacts(t) for t in found] == [None, MOST_CONTACTS, 2, 1]
+    assert [constraint_rows(t) for t in found[1:]] == [1 + 4 * n for n in (MOST_CONTACTS, 2, 1)]
+    assert not has_constraints(put_model(model, 0))
 
 
 def test_a_model_with_few_contacts_keeps_them_as_they_were():
     model = chain()
-    same = twin(model)
-    assert nearest_only(same) is None
+    same = put_model(model)
+    assert kept_contacts(same) is None
     assert (same.nnumeric, same.names) == (model.nnumeric, model.names)
-    assert jax.tree.structure(same) == jax.tree.structure(twin(model, 3))
-    assert jax.tree.structure(same) != jax.tree.structure(twin(model, 2))
+    assert jax.tree.structure(same) == jax.tree.structure(put_model(model, 3))
+    assert jax.tree.structure(same) != jax.tree.structure(put_model(model, 2))
 
 
 @pytest.mark.parametrize("number", [-1, 2.5, "all", None])
 def test_numbers_of_contacts_are_whole(number):
     with pytest.raises(DraxError, match=r"contacts is .*give True, False or a whole number"):
-        twin(chain(), number)
+        put_model(chain(), number)
 
 
 TOUCH = "<sensor><{}/></sensor>"
@@ -238,7 +239,7 @@ def test_touch_sensors_feel_nothing_where_contacts_are_left_out():
     ids=["contact-sensor", "rangefinder", "elliptic"],
 )
 def test_what_mjx_fails_in_without_contacts_or_materials_is_stepped(parts):
-    on_device = twin(rigid(**parts))
+    on_device = put_model(rigid(**parts))
     end = jax.eval_shape(partial(step, on_device), jnp.zeros(4), jnp.zeros(2))
     assert end.shape == (4,)
 
@@ -249,7 +250,7 @@ def test_what_mjx_fails_in_without_contacts_or_materials_is_stepped(parts):
 def test_contact_sensors_that_mjx_refuses_are_left_out(contact):
     model = chain(more=TOUCH.format(f'contact name="odd" {contact}'))
     assert differences(model) == ["sensor 'odd' is unknown to MJX: do not use it in costs"]
-    assert twin(model).nsensor == 1
+    assert put_model(model).nsensor == 1
 
 
 CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import anything, bounded
 
-from mjx_drax.physics.mjcf import load
+from mjx_drax.physics.source import load
 
 NUMBERS = ("x_init", "horizon", "dt", "x_bounds", "u_bounds", "x_scatter", "u_scatter")
 

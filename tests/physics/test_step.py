@@ -15,8 +15,8 @@ from mjx_drax import Autodiff, Smoothed, from_mjcf
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.linearize import linearize
 from mjx_drax.physics import states as host
-from mjx_drax.physics.agreement import Engine
-from mjx_drax.problem.problem import Trajectory
+from mjx_drax.physics.states import Engine
+from mjx_drax.problem.trajectory import Trajectory
 
 FLOATING = """
 <mujoco model="floating">
@@ -205,7 +205,7 @@ def test_the_nearest_contacts_are_enough_where_no_more_act():
         },
     }
     for name, parts in states.items():
-        assert Engine(model).touching(at(model, **parts)) <= 2, name
+        assert Engine(model).active_contacts(at(model, **parts)) <= 2, name
     assert_steps_like_the_c_engine(model, states, contacts=2)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from mjx_drax.models import path
 from mjx_drax.physics._mjx import mjx
-from mjx_drax.physics._mujoco import mujoco
+from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
 
 EVERY_JOINT = """<mujoco><worldbody>

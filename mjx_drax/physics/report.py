@@ -3,35 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.physics import step as physics
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.agreement import WRONG, Engine, compare, probes
-from mjx_drax.physics.mjcf import (
-    bounded_joints,
-    initial_state,
-    load,
-    model_name,
-    require_movable,
-    require_regular,
+from mjx_drax.physics.actuators import largest_moment_arms
+from mjx_drax.physics.checks import (
+    checked_start,
+    compare,
+    require_small_error,
     require_traceable,
-    steps_between_knots,
+    samples,
 )
+from mjx_drax.physics.dynamics import MjxDynamics
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.mjcf import steps_between_knots
 from mjx_drax.physics.mjx_model import (
     constraint_rows,
     contact_pairs,
     contact_points,
     differences,
-    moments,
-    nearest_only,
-    twin,
+    kept_contacts,
+    put_model,
 )
+from mjx_drax.physics.source import load, model_name
+from mjx_drax.physics.states import Engine
 
 Report = dict[str, Any]
 
@@ -81,35 +79,27 @@ def check(
         "obstacle": None,
     }
     try:
-        require_movable(model, name)
-        x_init = initial_state(model, name, None)
-        require_regular(model, name, x_init)
-        bounded = bounded_joints(model, x_init)
+        x_init, bounded = checked_start(model, name)
         report["joints"] = _joints(model, bounded)
-        planned = twin(model, bounded=bounded)
+        planned = put_model(model, bounded=bounded)
         report["sizes"]["constraint_rows"] = constraint_rows(planned)
         report["contact_points"] = {
-            "all": len(contact_points(twin(model, np.iinfo(int).max))),
+            "all": len(contact_points(put_model(model, np.iinfo(int).max))),
             "kept": len(contact_points(planned)),
-            "nearest": nearest_only(planned),
+            "nearest": kept_contacts(planned),
         }
         progress(f"{name}: compiling one step of MJX and its derivatives ...")
-        require_traceable(name, partial(physics.forward, planned), model)
+        dynamics = MjxDynamics(planned, report["timing"]["dt"], model, steps)
+        require_traceable(model, name, dynamics.observe)
         report["agreement"] = _agreement(model, x_init, bounded)
-        error = report["agreement"]["velocity_error"]
-        if not error <= WRONG:
-            reasons = "; ".join(report["differences"]) or "for no reason that is known"
-            report["obstacle"] = (
-                f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities: "
-                f"{reasons}."
-            )
+        require_small_error(name, report["agreement"]["velocity_error"], report["differences"])
     except DraxError as error:
         report["obstacle"] = str(error)
     return report
 
 
 def _agreement(model: mujoco.MjModel, x_init: np.ndarray, bounded: np.ndarray) -> Report:
-    at = probes(Engine(model), x_init, bounded)
+    at = samples(Engine(model), x_init, bounded)
     found = compare(model, at, bounded=bounded, derivatives=True)
     return {
         "velocity_error": float(found.velocity.max()),
@@ -121,7 +111,7 @@ def _agreement(model: mujoco.MjModel, x_init: np.ndarray, bounded: np.ndarray) -
 
 def _joints(model: mujoco.MjModel, bounded: np.ndarray) -> list[Report]:
     """What becomes of every joint."""
-    pulls, found = np.abs(moments(model)) > 0, []
+    pulls, found = largest_moment_arms(model) > 0, []
     for j in range(model.njnt):
         limited = bool(model.jnt_limited[j])
         actuators = np.flatnonzero(pulls[:, model.dof_jntid == j].any(axis=1))

@@ -1,7 +1,7 @@
-"""One place that imports MuJoCo, so that a broken MUJOCO_GL gives one clear sentence.
+"""The one place that imports MuJoCo, so that a broken MUJOCO_GL gives one clear sentence.
 
-With MUJOCO_GL set to a platform whose libraries are missing, `import mujoco` itself fails deep
-inside PyOpenGL.
+If the libraries of the platform that MUJOCO_GL names are missing, `import mujoco` itself fails,
+deep inside of PyOpenGL.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ APT_EGL = "apt-get install -y --no-install-recommends libegl1 libopengl0 libgl1-
 
 try:
     import mujoco as mujoco
+    from mujoco import rollout as rollout
 except (AttributeError, ImportError) as error:
     _backend = os.environ.get("MUJOCO_GL")
     if not _backend:

@@ -1,0 +1,301 @@
+"""Whether a model can be planned with: all that is asked of it before a problem is built.
+
+`checked_start` asks what needs no MJX; `require_traceable` whether MJX can step the model;
+`require_same_step` and `warn_of_lost_contacts` whether its steps are those of MuJoCo's C engine.
+For this, both engines take one step in float64 from the same states. What differs by more than
+rounding is wrong in every plan, and the certificate would find that only after a solve.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from mjx_drax.base.errors import DraxError, DraxWarning, reason, shown
+from mjx_drax.base.numbers import vector
+from mjx_drax.physics import step as one_step
+from mjx_drax.physics.actuators import control_ranges, disabled
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.mjx_model import bounded_joints, differences, free_ranges, put_model
+from mjx_drax.physics.states import Engine, integrate, quiet, set_state
+
+SINGULAR = 1e-10
+"""Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
+
+WRONG, NOTICEABLE = 1e-2, 1e-6
+"""One-step errors of velocities [rad/s, m/s] above which a model is refused, or warned of."""
+
+MOMENTS = (0.05, 0.2, 0.6)
+"""Times [s] of the states that the engines are compared at, along a motion from x_init."""
+
+SHIFT, SPEED = 0.02, 0.5
+"""Standard deviations of positions [rad, m] and velocities about x_init, for one more state."""
+
+
+def checked_start(
+    model: mujoco.MjModel, name: str, x_init: ArrayLike | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """x_0 (nx,), and the joints whose range becomes a bound on knots (njnt,); see `bounded_joints`.
+
+    Args:
+        model: to plan with.
+        name: what errors call it.
+        x_init: as given by the user; by default the first keyframe, else the default pose at rest.
+
+    Raises:
+        DraxError: the model cannot move, x_init does not fit it, or its acceleration cannot be
+            found there.
+    """
+    _require_movable(model, name)
+    x0 = _initial_state(model, name, x_init)
+    _require_regular(model, name, x0)
+    return x0, bounded_joints(model, x0)
+
+
+def _require_movable(model: mujoco.MjModel, name: str) -> None:
+    """Complain about a model that no control can move."""
+    if model.nv == 0:
+        raise DraxError(f"{name} has no joints: there is nothing to move; add a <joint>.")
+    if model.nu == 0:
+        raise DraxError(f"{name} has no actuators: add an <actuator> (to MJCF: a URDF has none).")
+    if disabled(model).all():
+        raise DraxError(
+            f"all actuators of {name} are disabled: clear the flag actuation and "
+            "actuatorgroupdisable in <option>."
+        )
+
+
+def _initial_state(model: mujoco.MjModel, name: str, x_init: ArrayLike | None) -> np.ndarray:
+    """x_0 (nx,) as given, or the first keyframe, or the default pose at rest."""
+    if x_init is not None:
+        x0 = np.array(vector("x_init", x_init), float)  # a copy: it will be scaled
+    elif model.nkey:
+        x0 = np.concatenate([model.key_qpos[0], model.key_qvel[0], model.key_act[0]])
+    else:
+        x0 = np.concatenate([model.qpos0, np.zeros(model.nv + model.na)])
+    nx = model.nq + model.nv + model.na
+    if not np.isfinite(x0).all():
+        raise DraxError(f"the first keyframe of {name} is {shown(x0.tolist())}: give x_init.")
+    if x0.shape != (nx,):
+        raise DraxError(
+            f"x_init has {x0.shape[0]} numbers; {name} has {nx}: qpos ({model.nq}), "
+            f"qvel ({model.nv}), act ({model.na}). Give {nx}."
+        )
+    for q, _ in Joints.of(model).quaternions:
+        if abs(np.linalg.norm(x0[q : q + 4]) - 1.0) > 1e-3:
+            raise DraxError(
+                f"x_init holds the quaternion {x0[q : q + 4].tolist()} at {q}: "
+                "scale it to length 1."
+            )
+    mujoco.mj_normalizeQuat(model, x0[: model.nq])
+    return x0
+
+
+def _require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> None:
+    """Complain about a model whose acceleration cannot be found at x_init (nx,)."""
+    data = mujoco.MjData(model)
+    set_state(model, data, x_init)
+    with quiet():
+        mujoco.mj_forward(model, data)
+    M = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    scale = np.sqrt(np.diag(M))
+    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+    if not values[0] > SINGULAR:
+        along = vectors[:, 0]
+        joints = model.dof_jntid[np.abs(along) > 0.5 * np.abs(along).max()]
+        names = ", ".join(str(model.joint(j).name or j) for j in dict.fromkeys(joints.tolist()))
+        raise DraxError(
+            f"the inertia of {name} is singular, because joints move bodies alike ({names}): leave "
+            'one of them out, or give them armature="0.01".'
+        )
+    if not np.isfinite(data.qacc).all():
+        raise DraxError(f"{name} has no finite acceleration at x_init: give another x_init.")
+
+
+def require_traceable(
+    model: mujoco.MjModel, name: str, forward: Callable[[Array, Array], Any]
+) -> None:
+    """Complain about a model that MJX accepts, but fails in when it traces forward(x, u).
+
+    Raises:
+        DraxError: says in what it fails.
+    """
+    x, u = jnp.zeros(model.nq + model.nv + model.na), jnp.zeros(model.nu)
+    try:
+        jax.eval_shape(forward, x, u)
+    except Exception as error:  # of any kind, deep inside MJX
+        raise DraxError(
+            f"MJX fails in a step of {name} ({reason(error)}): leave out sensors, tendons and "
+            "equality constraints, by which it may fail, until it does not."
+        ) from error
+
+
+@dataclass(frozen=True)
+class Samples:
+    """States (n, nx), x_init first, and controls (n, nu) at which the engines are compared."""
+
+    x: np.ndarray
+    u: np.ndarray
+
+
+@dataclass(frozen=True)
+class StepErrors:
+    """How far one step of MJX is from one of the C engine.
+
+    Attributes:
+        velocity: largest error of qvel after one step, (n,) [rad/s, m/s]; x_init comes first.
+        jacobian: largest error of an entry of [df/dx df/du] at x_init, in tangent space, relative
+            to the largest entry; NaN if it was not asked for. Where f has a kink, as at a limit,
+            the derivative to either side counts as right, for each column.
+    """
+
+    velocity: np.ndarray
+    jacobian: float = np.nan
+
+
+def samples(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int = 0) -> Samples:
+    """x_init, a state close to it, and states along motions under constant random controls.
+
+    Args:
+        engine: which makes the motions.
+        x_init: (nx,).
+        bounded: joints whose positions are clipped to their ranges, (njnt,).
+        seed: of the random numbers.
+    """
+    model, rng = engine.model, np.random.default_rng(seed)
+    nv, scale = model.nv, np.zeros(2 * model.nv + model.na)
+    scale[:nv], scale[nv : 2 * nv] = SHIFT, SPEED
+    u = rng.uniform(*control_ranges(model), (2 + len(MOMENTS), model.nu))
+    x = [x_init, integrate(model, x_init, scale * rng.normal(size=scale.shape))]
+    for moment, control in zip(MOMENTS, u[2:], strict=True):
+        x.append(engine.step(x_init, control, max(1, round(moment / model.opt.timestep))))
+    states, where = np.stack(x), model.jnt_qposadr[bounded]
+    lower, upper = free_ranges(model)
+    states[:, where] = np.clip(states[:, where], lower[bounded], upper[bounded])
+    usable = np.isfinite(states).all(axis=1)
+    return Samples(states[usable], u[usable])
+
+
+def compare(
+    model: mujoco.MjModel,
+    at: Samples,
+    contacts: bool | int = True,
+    bounded: np.ndarray | None = None,
+    derivatives: bool = False,
+) -> StepErrors:
+    """Compare one step of MJX with one of the C engine. Compiles the step.
+
+    Args:
+        model: which is not changed.
+        at: states, x_init first, and controls.
+        contacts, bounded: as for `put_model`.
+        derivatives: whether to compare them as well, at x_init.
+
+    Raises:
+        DraxError: MJX does not support the model.
+    """
+    engine, joints, nv = Engine(model, contacts), Joints.of(model), model.nv
+    ndx = 2 * nv + model.na
+    with jax.enable_x64(True):
+        on_device = put_model(model, contacts, bounded)
+
+        def reached(x: Array, u: Array) -> Array:
+            return one_step.step(on_device, x, u)
+
+        def slope(x: Array, u: Array) -> tuple[Array, Array]:
+            end = reached(x, u)
+
+            def change(dz: Array) -> Array:
+                moved = reached(joints.integrate(x, dz[:ndx]), u + dz[ndx:])
+                return joints.difference(moved, end)
+
+            return end, jax.jacfwd(change)(jnp.zeros(ndx + model.nu))
+
+        x, u = jnp.asarray(at.x), jnp.asarray(at.u)
+        if derivatives:
+            ends, slopes = jax.tree.map(np.asarray, jax.jit(jax.vmap(slope))(x, u))
+        else:
+            ends = np.asarray(jax.jit(jax.vmap(reached))(x, u))
+    wanted = np.stack([engine.step(*pair) for pair in zip(at.x, at.u, strict=True)])
+    velocities = slice(model.nq, model.nq + nv)
+    error = np.abs(ends - wanted)[:, velocities].max(axis=1)
+    if not derivatives:
+        return StepErrors(error)
+    sides = engine.slopes(at.x[0], at.u[0])
+    exact = np.stack([sides.mean(axis=0), *sides])
+    off = np.abs(slopes[0] - exact).max(axis=1).min(axis=0)  # of each column
+    return StepErrors(error, float(off.max() / np.abs(exact[0]).max()))
+
+
+def require_small_error(name: str, error: float, found: list[str], warn: bool = False) -> None:
+    """Refuse a model whose step has an error of velocities above `WRONG`, or warn of a smaller one.
+
+    Args:
+        name: of the model.
+        error: of velocities after one step of MJX [rad/s, m/s].
+        found: its `differences`.
+        warn: of errors above `NOTICEABLE`.
+
+    Raises:
+        DraxError: names the differences.
+    """
+    words = (
+        f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
+        f"{name}: {'; '.join(found) or 'for no reason that is known'}."
+    )
+    if not error <= WRONG:
+        raise DraxError(words)
+    if warn and error > NOTICEABLE:
+        warnings.warn(words, DraxWarning, stacklevel=4)
+
+
+def require_same_step(
+    model: mujoco.MjModel,
+    name: str,
+    x_init: np.ndarray,
+    contacts: bool | int,
+    bounded: np.ndarray,
+) -> None:
+    """Refuse or warn of a model that MJX is known to compute differently, if it does so.
+
+    Only models with `differences` are compared, because that compiles their step.
+
+    Raises:
+        DraxError: velocities after one step differ by more than `WRONG`.
+    """
+    found = differences(model, contacts)
+    if found:
+        at = samples(Engine(model, contacts), x_init, bounded)
+        error = float(np.max(compare(model, at, contacts, bounded).velocity))
+        require_small_error(name, error, found, warn=True)
+
+
+def warn_of_lost_contacts(
+    model: mujoco.MjModel, name: str, x_init: np.ndarray, kept: int | None, bounded: np.ndarray
+) -> None:
+    """Warn where more contacts act than a plan keeps; `kept` are of each friction dimension.
+
+    What is left out has no force in the plan, and the certificate would find that only later.
+    """
+    if kept is None:
+        return
+    engine = Engine(model)
+    most = max(engine.active_contacts(x) for x in samples(engine, x_init, bounded).x)
+    if most > kept:
+        warnings.warn(
+            f"{engine.active_contacts(x_init)} contacts of one friction dimension act at the "
+            f"x_init of {name} and up to {most} soon after, of which the plan keeps the nearest "
+            f"{kept}: give contacts={most}.",
+            DraxWarning,
+            stacklevel=3,
+        )
