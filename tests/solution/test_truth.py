@@ -1,0 +1,96 @@
+"""What a solution says of its chains is true of the knots that it holds.
+
+The problems have four local optima of different costs, in which different chains end: knots, costs
+and verdicts of two chains that were swapped would not fit.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax import Langevin, Restarts, Trajectory, from_function, solve, solve_batch
+
+VALLEYS = from_function(
+    lambda x, u: x + 0.1 * u,
+    x_init=[0.1, -0.1],
+    nu=2,
+    dt=0.1,
+    horizon=1.0,
+    running_residual=lambda x, u: 0.1 * u,
+    # Valleys at x_1, x_2 = -1 or 1: (-1, -1) is the deepest, (1, 1) the highest.
+    terminal_residual=lambda x: jnp.concatenate([5.0 * (x**2 - 1.0), x - jnp.array([-1.2, -1.4])]),
+)
+STARTS = np.array([[0.1, -0.1], [-0.2, 0.2], [0.0, 0.3]], np.float32)
+CHAINS = 8
+ONCE = Langevin(iterations=1, tail=40)
+"""Hardly any noise: a chain stays in the valley where it began."""
+TWICE = Restarts(ONCE, descent=40, attempts=2, enough=1.0)
+"""The second attempt works for the chains that did not end in the deepest valley."""
+
+
+def from_start(x):
+    return replace(VALLEYS, x_init=x)
+
+
+@pytest.fixture(scope="module", params=[ONCE, TWICE], ids=["once", "twice"])
+def solution(request):
+    return solve(VALLEYS, CHAINS, solver=request.param)
+
+
+@pytest.fixture(scope="module", params=[ONCE, TWICE], ids=["once", "twice"])
+def batch(request):
+    return solve_batch(from_start, STARTS, chains=CHAINS, solver=request.param)
+
+
+def assert_differ(costs):
+    """Some chains are in other valleys than others; else the tests below say nothing."""
+    assert np.ptp(costs) > 0.1
+
+
+def test_every_chain_has_its_own_knots(solution):
+    assert_differ(solution.cost)
+    costs = jax.vmap(VALLEYS.cost)(solution.trajectories)
+    np.testing.assert_allclose(costs, solution.cost, rtol=1e-3, atol=1e-4)
+    defects = jax.vmap(VALLEYS.max_defect)(solution.trajectories)
+    np.testing.assert_allclose(defects, solution.max_defect, atol=1e-5)
+
+
+def test_the_best_chain_of_every_problem_has_its_own_knots(batch):
+    for i, start in enumerate(STARTS):
+        assert_differ(batch.chain_cost[i])
+        problem = from_start(jnp.asarray(start))
+        knots = Trajectory(jnp.asarray(batch.x[i, 1:]), jnp.asarray(batch.u[i]))
+        np.testing.assert_allclose(problem.cost(knots), batch.cost[i], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(problem.max_defect(knots), batch.max_defect[i], atol=1e-5)
+        np.testing.assert_allclose(batch.open_loop.states[i], batch.x[i], atol=1e-2)
+    np.testing.assert_array_equal(batch.cost, batch.chain_cost.min(axis=1))
+
+
+def test_an_infeasible_chain_does_not_succeed(solution):
+    assert solution.success.all()
+    infeasible = np.arange(CHAINS) % 3 == 0
+    worse = replace(solution, max_defect=np.where(infeasible, 1.0, solution.max_defect))
+    np.testing.assert_array_equal(worse.feasible, ~infeasible)
+    np.testing.assert_array_equal(worse.success, ~infeasible)
+    np.testing.assert_array_equal(worse.certified_chains, ~infeasible)
+    np.testing.assert_array_equal(worse.tracked, ~infeasible)
+    assert worse.success_rate == 1 - infeasible.mean()
+    assert not infeasible[worse.best_chain]
+    lost = replace(solution, max_defect=np.ones(CHAINS))
+    assert not lost.success.any()
+    assert not lost.certified
+
+
+def test_a_chain_that_diverged_does_not_succeed(solution):
+    diverged = replace(solution, died_at=np.where(np.arange(CHAINS) == 1, 3, -1))
+    np.testing.assert_array_equal(diverged.success, np.arange(CHAINS) != 1)
+
+
+def test_an_infeasible_problem_is_not_certified(batch):
+    assert batch.certified.all()
+    defects = batch.chain_defect.copy()
+    defects[1, batch.best[1]] = 1.0
+    np.testing.assert_array_equal(replace(batch, chain_defect=defects).certified, [1, 0, 1])
