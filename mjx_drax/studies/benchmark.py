@@ -108,23 +108,33 @@ def run(
         report: called with every row as it is ready.
 
     Raises:
-        DraxError: there is no such suite or task, the suite does not have a task, or it needs
-            casadi, which is not installed.
+        DraxError: see `check`.
     """
-    if suite is not None and suite not in SUITES:
-        raise DraxError(f"there is no suite {suite!r}: choose one of {', '.join(SUITES)}.")
+    check(names, suite)
     measured, known = SUITES[suite] if suite else (_tasks, tasks.names)
-    for name in names:
-        tasks.load(name)
-        if name not in known():
-            raise DraxError(f"the suite {suite} has no {name}: it has {', '.join(known())}.")
-    if suite == "peers":
-        require_casadi()
     rows = []
     for found in measured(tuple(names or known()), seeds, chains):
         rows.append(found)
         report(found)
     return rows
+
+
+def check(names: Sequence[str], suite: str | None) -> None:
+    """Complain about what `run` could not measure.
+
+    Raises:
+        DraxError: there is no such suite or task, the suite does not have a task, or it needs
+            casadi, which is not installed.
+    """
+    if suite is not None and suite not in SUITES:
+        raise DraxError(f"there is no suite {suite!r}: choose one of {', '.join(SUITES)}.")
+    known = SUITES[suite][1]() if suite else tasks.names()
+    for name in names:
+        tasks.load(name)
+        if name not in known:
+            raise DraxError(f"the suite {suite} has no {name}: it has {', '.join(known)}.")
+    if suite == "peers":
+        require_casadi()
 
 
 # Suites

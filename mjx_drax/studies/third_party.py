@@ -53,8 +53,9 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
         seed: of the posture and of the solve.
     """
     from mjx_drax.modelling.postures import reach
-    from mjx_drax.physics.mjcf import MjxDynamics, load
+    from mjx_drax.physics.dynamics import MjxDynamics
     from mjx_drax.physics.mjx_model import constraint_rows
+    from mjx_drax.physics.source import load
     from mjx_drax.solution.solution import solve
 
     row: Row = {"model": name}

@@ -4,16 +4,18 @@ import errno
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from inspect import signature
 
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, Geometric, Solution, cli, tasks
+from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
 from mjx_drax.cli import main
-from mjx_drax.physics.check import text
+from mjx_drax.physics.report import text
 from mjx_drax.search.restarts import CHUNK
 
 COST = """
@@ -141,7 +143,7 @@ def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):
     def interrupt(self, done, total, info):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli._Bar, "__call__", interrupt)
+    monkeypatch.setattr("mjx_drax.cli.progress.Bar.__call__", interrupt)
     arguments = "solve pendulum --horizon 0.5 --chains 2 --iterations 400 --no-video"
     assert main([*arguments.split(), "--out", str(tmp_path)]) == 1
     assert "written to" in capsys.readouterr().out
@@ -152,7 +154,7 @@ def test_ctrl_c_before_there_is_anything_to_save(monkeypatch, capsys):
     def interrupt(options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "_list", interrupt)
+    monkeypatch.setattr("mjx_drax.cli.list_tasks.run", interrupt)
     assert main(["list"]) == 130
     assert capsys.readouterr().err == "mjx-drax: interrupted\n"
 
@@ -246,6 +248,14 @@ def test_tasks_go_by_their_beginnings():
     assert tasks.load("pendulum").__name__.endswith(".pendulum")
     with pytest.raises(DraxError, match=r"several tasks begin with 'pend': .*pendulum_swingup"):
         tasks.load("pend")
+
+
+def test_help_names_all_that_a_cost_file_may_define(capsys):
+    with pytest.raises(SystemExit):
+        main(["solve", "--help"])
+    out = capsys.readouterr().out
+    for name in set(signature(from_mjcf).parameters) - {"model", "name"}:
+        assert re.search(rf"\b{name}\b", out), name
 
 
 def test_errors_name_cause_and_fix(own, capsys):

@@ -1,0 +1,51 @@
+"""Measure success and time, alone or beside other methods.
+
+Tasks are solved for several seeds. A table is printed; benchmark.json (a list of rows) and
+benchmark.png (success against time) are written. The suites:
+
+  cpu      every task, and one pendulum on one thread beside IPOPT
+  gpu      more chains, and 16,384 random pendulums
+  devices  one solve on 1, 2, 4, ... devices
+  peers    ablations, IPOPT, MPPI, CEM and model-based diffusion
+
+IPOPT needs pip install "mjx-drax[peers]". The exit status is 0 if all rows of this solver are
+certified.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from mjx_drax.cli.common import at_least_1, say
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which tasks, how often, and where to."""
+    parser.add_argument("tasks", nargs="*", metavar="TASK", help="default: all of them")
+    parser.add_argument("--suite", metavar="SUITE", help="default: each task as it is, alone")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="S")
+    parser.add_argument(
+        "--chains", type=at_least_1, metavar="N", help="default: each task's, or the suite's"
+    )
+    parser.add_argument("--out", metavar="DIR", default="out/benchmark")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print each row as it is ready, and save them all."""
+    from mjx_drax.solution.save import writable
+    from mjx_drax.studies import benchmark
+
+    benchmark.check(options.tasks, options.suite)
+    folder = writable(options.out)
+    say(benchmark.HEADER)
+    rows = benchmark.run(
+        options.tasks,
+        options.seeds,
+        options.chains,
+        options.suite,
+        report=lambda row: say(benchmark.line(row)),
+    )
+    if options.suite in ("cpu", "gpu") and not benchmark.has_casadi():
+        say('IPOPT is left out: it needs pip install "mjx-drax[peers]".')
+    say(f"written to {', '.join(map(str, benchmark.save(rows, folder)))}")
+    return 0 if benchmark.certified(rows) else 1

@@ -1,0 +1,29 @@
+"""Say what becomes of a model of your own, and whether MJX computes it as MuJoCo does.
+
+This is about joints, actuators and contacts, and how far one step of MJX and its derivatives are
+from MuJoCo's C engine. The exit status is 0 if the model can be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from mjx_drax.cli.common import cache_compilations, say
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The model, and the form of the report."""
+    parser.add_argument("model", metavar="XML", help="MJCF file")
+    parser.add_argument("--json", action="store_true", help="the same as JSON")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check the model; progress goes to standard error."""
+    from mjx_drax.physics.report import check, text
+
+    cache_compilations()
+    report = check(options.model, lambda line: print(line, file=sys.stderr, flush=True))
+    say(json.dumps(report, indent=1) if options.json else text(report))
+    return 0 if report["obstacle"] is None else 1

@@ -1,0 +1,82 @@
+"""A problem from the user's own model and cost file, `solve --model XML --cost PY`."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from mjx_drax.base.errors import DraxError, reason
+
+if TYPE_CHECKING:
+    from mjx_drax.method.langevin import Langevin
+    from mjx_drax.problem.problem import Problem
+    from mjx_drax.search.restarts import Restarts
+
+HELP = """\
+A cost file is Python. It defines at least one of
+  running_cost(data, u), terminal_cost(data)           scalars
+  running_residual(data, u), terminal_residual(data)   vectors: adds half the squared norm
+on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
+  goal(data) -> bool       what a replay in MuJoCo must reach
+  equality(data, u), terminal_equality(data)       vectors held at 0
+  inequality(data, u), terminal_inequality(data)   vectors held <= 0
+  horizon, dt              [s]
+  x_init                   [qpos, qvel, act]
+  x_bounds, u_bounds       (lower, upper)
+  x_scatter, u_scatter     (lower, upper): where initial knots are drawn
+  guess(key) -> Trajectory initial knots of one chain
+  contacts                 how many contact points the plan keeps, the nearest ones; False: none
+  derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
+  solver                   a mjx_drax.Restarts or mjx_drax.Langevin
+"""
+
+
+def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Langevin | Restarts]:
+    """The problem, over the file's horizon or one of so many seconds, and the settings to solve it.
+
+    The file may define every argument of `from_mjcf` by its name.
+
+    Raises:
+        DraxError: the file is missing, fails, or misses something; or the problem cannot be built.
+    """
+    from inspect import signature
+
+    from mjx_drax import Langevin, Restarts, from_mjcf
+
+    module = _module(Path(cost))
+    names = set(signature(from_mjcf).parameters) - {"model", "name"}
+    given = {name: value for name, value in vars(module).items() if name in names}
+    if horizon is not None:
+        given["horizon"] = horizon
+    if "horizon" not in given:
+        raise DraxError(f"no horizon: define it in {cost} or give --horizon SECONDS.")
+    problem = from_mjcf(model, name=Path(model).stem, **given)
+    solver = getattr(module, "solver", None) or Restarts()
+    if not isinstance(solver, Langevin | Restarts):
+        raise DraxError(f"solver in {cost} is {solver!r}: give a mjx_drax.Restarts.")
+    return problem, solver
+
+
+def _module(path: Path) -> ModuleType:
+    """The cost file as a module; it can import files beside it."""
+    if not path.is_file():
+        raise DraxError(f"there is no cost file {str(path)!r}: check the path.")
+    spec = importlib.util.spec_from_file_location("mjx_drax_cost", path)
+    if spec is None or spec.loader is None:
+        raise DraxError(
+            f"the cost file {str(path)!r} is not a Python file: its name must end in .py."
+        )
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise DraxError(
+            f"the cost file {str(path)!r} failed: {reason(error)}. Correct it there."
+        ) from error
+    finally:
+        sys.path.pop(0)
+    return module

@@ -1,0 +1,94 @@
+"""Model predictive control: plan again and again while MuJoCo's C engine runs.
+
+A task's model is driven several times, with random pushes. Plans per second, latency, cost and the
+share of runs that end in the goal are printed; mpc.json is written. The exit status is 0 if all
+runs end in the goal.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from mjx_drax.base.errors import require_not_negative
+from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_nothing
+
+NUMBERS: dict[str, tuple[Any, Any, str]] = {
+    "chains": (at_least_1, 8, "number of chains; default 8"),
+    "explorers": (int, None, "how many of them explore; default half"),
+    "iterations": (at_least_1, 2, "of every chain for a plan; default 2"),
+    "every": (at_least_1, 1, "control steps between two plans; default 1"),
+    "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),
+    "horizon": (float, None, "of a plan [s]; default the task's"),
+    "duration": (float, None, "of a run [s]; default the horizon and 8 more"),
+    "runs": (at_least_1, 10, "default 10"),
+    "pushes": (int, 2, "in every run; default 2"),
+    "push": (float, 1.0, "size of a push, as a velocity of the body pushed [m/s]; default 1"),
+    "mass": (float, 1.0, "factor on the masses of the simulated model; default 1"),
+    "noise": (float, 0.0, "standard deviation of measured states; default 0"),
+    "shaking": (float, 0.0, "random changes of velocities in a second; default 0"),
+    "seed": (int, 0, "default 0"),
+}
+"""Type, default and help."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The task, numbers, and what to write."""
+    parser.add_argument("task", help="a name from `mjx-drax list`")
+    for name, (kind, default, words) in NUMBERS.items():
+        parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=words)
+    parser.add_argument(
+        "--async",
+        dest="realtime",
+        action="store_true",
+        help="the simulation runs in real time and applies the newest plan",
+    )
+    parser.add_argument("--video", action="store_true", help="film the first run: mpc.mp4")
+    parser.add_argument("--out", metavar="DIR", help="default out/mpc_TASK")
+    parser.add_argument("--json", action="store_true", help="print mpc.json, and nothing else")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Drive the model, and report; what cannot work is refused before anything compiles."""
+    from mjx_drax import tasks
+    from mjx_drax.control import trials as runs
+    from mjx_drax.control.mpc import MPC
+    from mjx_drax.control.plant import Plant
+    from mjx_drax.solution.save import writable
+    from mjx_drax.view.rendering import check as require_drawing
+
+    problem = make(tasks.load(options.task), options.horizon)
+    names = ("chains", "explorers", "iterations", "every", "hold", "seed")
+    policy = MPC(problem, **{name: getattr(options, name) for name in names})
+    usual = float(problem.times[-1]) + 8.0
+    duration = usual if options.duration is None else options.duration
+    require_not_negative("push", options.push)
+    trials = runs.Trials(policy, duration, options.realtime)
+    trials.check(options.runs, options.pushes)
+    errors = {name: getattr(options, name) for name in ("mass", "noise", "shaking")}
+    Plant(problem, **errors)  # refuses numbers that make no sense
+    if options.video:
+        require_drawing(problem)
+    folder = writable(options.out or Path("out") / f"mpc_{problem.name}")
+    tell = say_nothing if options.json else say
+    cache_compilations()
+    tell(f"{problem.name}: K = {problem.horizon} knots, {options.chains} chains; compiling ...")
+    policy.reset(problem.x_init)
+    tell(f"first solve and compilation took {policy.first_solve:.1f} s")
+
+    def report(number: int, motion: runs.Motion) -> None:
+        verdict = {True: "ends in the goal", False: "misses the goal", None: "done"}
+        tell(f"run {number}: {verdict[motion.reached]} after {len(motion.pushes)} pushes")
+
+    trials.run(options.runs, options.pushes, options.push, options.seed, report, **errors)
+    numbers = {**trials.summary(), "push": options.push, "hold": options.hold, **errors}
+    written = [runs.save(numbers, folder).name]
+    if options.video:
+        written.append(runs.film(problem, trials.motions[0], folder / "mpc.mp4").name)
+    for line in runs.lines(numbers):
+        tell(line)
+    tell(f"written to {folder}/: {', '.join(written)}")
+    if options.json:
+        print((folder / "mpc.json").read_text(encoding="utf-8"), end="", flush=True)
+    return 0 if numbers["success_rate"] in (None, 1.0) else 1

@@ -1,0 +1,64 @@
+"""The pictures and films that `solve` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mjx_drax.solution.solution import Solution
+
+NAMES = (
+    "plot.png",
+    "multipliers.png",
+    "phase.png",
+    "optima.png",
+    "video.mp4",
+    "timelapse.png",
+    "film.mp4",
+)
+"""All that there may be."""
+
+
+def film_path(asked: str, folder: Path) -> Path:
+    """Where a film goes, "" being the usual place; refuses a place that cannot be written."""
+    from mjx_drax.base.files import require_room
+    from mjx_drax.view.video import film_path as checked
+
+    film = checked(asked or folder / "film.mp4")
+    require_room(film)
+    return film
+
+
+def write_plots(solution: Solution, folder: Path, draw: Any) -> list[str]:
+    """Plots of a solution; returns the files' names."""
+    from mjx_drax.view.plotting import plot_optima, plot_solution
+    from mjx_drax.view.portraits import has_phases, plot_multipliers, plot_phase
+
+    plot_solution(solution, folder / "plot.png", draw=draw)
+    plot_multipliers(solution, folder / "multipliers.png")
+    written = ["plot.png", "multipliers.png"]
+    if has_phases(solution.problem.dynamics):
+        plot_phase(solution, folder / "phase.png")
+        written.append("phase.png")
+    if len(solution.optima) > 1:
+        plot_optima(solution, folder / "optima.png", draw=draw)
+        written.append("optima.png")
+    return written
+
+
+def write_video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any]) -> list[str]:
+    """The motion as a video, and in one picture; returns the files' names."""
+    from mjx_drax.physics.dynamics import mujoco_model
+    from mjx_drax.view.rendering import render
+    from mjx_drax.view.timelapse import render_timelapse
+
+    model = mujoco_model(solution.problem.dynamics)
+    if model is None and draw is None:
+        return []
+    render(solution, folder / "video.mp4", draw=draw, **look)
+    if model is None:
+        return ["video.mp4"]
+    still = {name: look[name] for name in ("camera", "size") if name in look}
+    render_timelapse(solution, folder / "timelapse.png", **still)
+    return ["video.mp4", "timelapse.png"]

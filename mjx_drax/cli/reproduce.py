@@ -1,0 +1,36 @@
+"""Make a figure or table of the paper again: writes NAME.png and NAME.json."""
+
+from __future__ import annotations
+
+import argparse
+
+from mjx_drax.cli.common import at_least_1, cache_compilations, say
+from mjx_drax.studies import reproduce
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which figure, its size, and where to."""
+    parser.add_argument(
+        "name", metavar="NAME", choices=reproduce.NAMES, help=", ".join(reproduce.NAMES)
+    )
+    parser.add_argument("--out", metavar="DIR", default="out/reproduce")
+    parser.add_argument(
+        "--chains", type=at_least_1, metavar="N", help="number of chains; at most so many problems"
+    )
+    parser.add_argument(
+        "--iterations",
+        type=at_least_1,
+        metavar="K",
+        help="instead of the published or usual number",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Make the figure, and print its table."""
+    cache_compilations()
+    numbers = reproduce.run(options.name, options.out, options.chains, options.iterations)
+    from mjx_drax.studies.reproduce.output import table
+
+    say(table(numbers))
+    say(f"written to {options.out}/: {options.name}.png, {options.name}.json")
+    return 0

@@ -1,0 +1,183 @@
+"""Solve a task, or a model and cost of your own; replay it; film it.
+
+The exit status is 0 only if the best trajectory is certified.
+
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mjx_drax.base.errors import DraxError
+from mjx_drax.cli import cost_file, exports, pictures
+from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_nothing
+from mjx_drax.cli.progress import Bar
+
+if TYPE_CHECKING:
+    from mjx_drax.method.langevin import Langevin
+    from mjx_drax.problem.problem import Problem
+    from mjx_drax.search.restarts import Restarts
+
+__doc__ += cost_file.HELP
+
+LOOK = ("camera", "size", "fps", "speed")
+"""What a user may say about videos and films."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What to solve, how, and what to write."""
+    add = parser.add_argument
+    add("task", nargs="?", help="a name from `mjx-drax list`")
+    add("--model", metavar="XML", help="MJCF file of your own, with --cost")
+    add("--cost", metavar="PY", help="Python file with the cost (see above)")
+    add("--chains", type=at_least_1, metavar="N", help="number of chains")
+    add(
+        "--iterations",
+        type=at_least_1,
+        metavar="K",
+        help="iterations with noise of an attempt; those without keep their share",
+    )
+    add("--seed", type=int, default=0, metavar="S", help="default 0")
+    add("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
+    add("--out", metavar="DIR", help="default out/TASK")
+    add(
+        "--checkpoint",
+        metavar="FILE",
+        help="written every half minute; where it is there, the solve goes on from it",
+    )
+    add("--no-video", action="store_true", help="leave out video.mp4 and timelapse.png")
+    add(
+        "--film",
+        nargs="?",
+        const="",
+        metavar="FILE",
+        help="also film how the knots condense into the motion: .mp4, .gif or .webp; "
+        "default DIR/film.mp4",
+    )
+    add(
+        "--camera",
+        metavar="NAME",
+        help="a camera of the model, or free: one that frames the whole motion",
+    )
+    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]")
+    add("--fps", type=float, metavar="N", help="frames per second")
+    add("--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion")
+    exports.add_arguments(parser)
+    add(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting of the solver, as in attempts=3, flow.tail=100 or "
+        "flow.noise=Geometric(3,0.001); again for more; a wrong name lists them all",
+    )
+    add("--quiet", action="store_true", help="print nothing but errors")
+    add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
+
+
+def _size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT as (height, width)."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT, such as 640x480")
+    return int(height), int(width)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Solve, save and draw; what cannot work is refused before anything compiles."""
+    problem, solver, chains, draw = _asked(options)
+    from mjx_drax.cli import summary
+    from mjx_drax.search.restarts import as_restarts
+    from mjx_drax.solution import save as results
+    from mjx_drax.solution.solution import solve
+    from mjx_drax.view.rendering import check as require_drawing
+
+    as_restarts(problem, chains, options.seed, solver)  # refuses settings that cannot work
+    wanted = exports.chosen(options)
+    exports.require(problem, wanted)
+    room = results.expected_size(problem, chains)
+    folder = results.writable(options.out or Path("out") / problem.name, room)
+    look = {name: getattr(options, name) for name in LOOK if getattr(options, name) is not None}
+    if look or options.film is not None:
+        require_drawing(problem, draw=draw, **look)
+    film = None if options.film is None else pictures.film_path(options.film, folder)
+    cache_compilations()
+    tell = say_nothing if options.quiet or options.json else say
+
+    if options.checkpoint is not None and Path(options.checkpoint).expanduser().exists():
+        tell(f"going on from {options.checkpoint}")
+    tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
+    with Bar() as bar:
+        solution = solve(
+            problem,
+            chains,
+            options.seed,
+            solver,
+            progress=None if options.quiet else bar,
+            record=1 if film else None,
+            checkpoint=options.checkpoint,
+        )
+    results.save(solution, folder)
+    written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]
+    if not options.no_video:
+        written += pictures.write_video(solution, folder, draw, look)
+    if film is not None:
+        from mjx_drax.view.film import render_diffusion
+
+        render_diffusion(solution, film, draw=draw, **look)
+    written += exports.write(solution, folder, wanted, tell)
+    for line in summary.lines(solution):
+        tell(line)
+    tell(f"written to {folder}/: {', '.join(written)}")
+    if film is not None:
+        tell(f"film written to {film}")
+        written += [film.name] * (film.resolve().parent == folder.resolve())
+    names = (*pictures.NAMES, *(file for file, _ in exports.EXPORTS.values()))
+    older = [name for name in names if name not in written and (folder / name).exists()]
+    if older:
+        tell(f"there from an earlier solve: {', '.join(older)}")
+    if options.json and not options.quiet:
+        print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
+    return 0 if solution.certified else 1
+
+
+class Asked(NamedTuple):
+    """What to solve, and how; `draw` draws what has no model."""
+
+    problem: Problem
+    solver: Langevin | Restarts
+    chains: int
+    draw: Any
+
+
+def _asked(options: argparse.Namespace) -> Asked:
+    """The named task, or the user's own problem, with the settings that the options change."""
+    from mjx_drax.search import settings
+    from mjx_drax.search.restarts import Restarts, with_iterations
+
+    if options.task is not None:
+        if options.model or options.cost:
+            raise DraxError(
+                f"both the task {options.task!r} and --model or --cost are given: choose one."
+            )
+        from mjx_drax import tasks
+
+        task = tasks.load(options.task)
+        problem, solver = make(task, options.horizon), Restarts()
+        chains, draw = getattr(task, "CHAINS", 64), getattr(task, "draw", None)
+    elif options.model and options.cost:
+        problem, solver = cost_file.load(options.model, options.cost, options.horizon)
+        chains, draw = 64, None
+    else:
+        raise DraxError("give a task (see `mjx-drax list`), or both --model XML and --cost PY.")
+    if options.iterations is not None:
+        solver = with_iterations(solver, options.iterations)
+    for text in options.settings:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (name and equals and value):
+            raise DraxError(f"--set {text!r}: give NAME=VALUE, such as attempts=3.")
+        solver = settings.changed(solver, name, value)
+    return Asked(problem, solver, options.chains or chains, draw)
