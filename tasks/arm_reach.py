@@ -13,7 +13,7 @@ from jax.tree_util import Partial
 from mjx_drax import Problem, from_mjcf
 from mjx_drax.modelling.distances import CAPSULE, DISTANCES, SPHERE, Shape
 from mjx_drax.models import path
-from mjx_drax.physics.mjcf import load
+from mjx_drax.physics.source import load
 
 DT = 0.04  # [s]
 DOWN = np.array([0.0, 0.0, -1.0])  # where the hand points at the end

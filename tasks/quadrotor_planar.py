@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 
 from mjx_drax import Problem, from_mjcf
 from mjx_drax.models import path
-from mjx_drax.physics.mjcf import load
+from mjx_drax.physics.source import load
 
 DT = 0.04  # [s]
 GOAL = np.array([2.5, 1.0])  # (x, z) [m]

@@ -10,7 +10,7 @@ from jax import Array
 
 from mjx_drax import Problem, from_mjcf
 from mjx_drax.models import path
-from mjx_drax.physics.mjcf import load
+from mjx_drax.physics.source import load
 
 DT = 0.02  # [s]
 AHEAD = np.array([0.3, 0.0])  # [m]

@@ -1,12 +1,12 @@
 """Signed distances between two geoms, as JAX functions of their poses.
 
-    distance > 0: how far they are apart;   distance < 0: how deep they overlap, times -1   [m]
+    distance > 0: they are that far apart;   distance < 0: they overlap by |distance|   [m]
 
-Spheres and capsules are points and segments with a radius; boxes, segments and sums of them are
-zonotopes, sum_j t_j g_j with |t_j| <= 1, whose faces are spanned by pairs of their generators g_j.
-Derivatives of the first order exist in forward and reverse mode and are finite everywhere. Where
-two pairs of points are equally near (parallel edges) they are those of one pair, or a mean. The
-place of the nearest points is not differentiated: by the envelope theorem it need not be.
+Spheres and capsules are points and segments with a radius. Boxes, segments and their Minkowski sums
+are zonotopes, sum_j t_j g_j with |t_j| <= 1, whose faces are spanned by pairs of their generators
+g_j. First derivatives exist in forward and reverse mode and are finite everywhere. Where two pairs
+of points are equally near (parallel edges) they are those of one pair, or a mean. The positions of
+the nearest points are not differentiated: by the envelope theorem that changes nothing.
 
 Which values are exact:
 
@@ -68,7 +68,7 @@ def _from_plane(reach: Callable[[Array, Array], Array]) -> Callable[[Shape, Shap
 
 
 def _capsule_capsule(one: Shape, other: Shape) -> Array:
-    """The nearest points of two segments are inside both, or one of them is an end."""
+    """The nearest points of two segments are inside of both, or one of them is an end point."""
     between = one.centre - other.centre
     a, b = one.size[1] * one.frame[:, 2], other.size[1] * other.frame[:, 2]
 

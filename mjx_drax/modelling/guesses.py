@@ -31,6 +31,7 @@ from mjx_drax.base.numbers import numbers
 from mjx_drax.physics.actuators import inverse_dynamics, middle_control
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.joints import BALL, FREE
 from mjx_drax.physics.source import index
 from mjx_drax.physics.states import between, interpolated, moved
 from mjx_drax.problem.problem import Problem
@@ -52,8 +53,8 @@ def still(problem: Problem) -> Trajectory:
 def waypoints(problem: Problem, poses: Iterable[tuple[float, Pose]]) -> Trajectory:
     """Through poses at given times, [(time [s], pose), ...]; a pose is qpos or a keyframe's name.
 
-    Positions go straight from one to the next, quaternions about one axis at constant speed. Before
-    the first the motion comes from x_init at time 0, and the last is held.
+    Positions go on a straight line from one to the next, quaternions about one axis, at constant
+    speed. The motion starts at x_init at time 0, unless a pose is given for it; the last is held.
 
     Raises:
         DraxError: a time is negative, not finite or given twice; a pose does not fit the model; the
@@ -133,8 +134,8 @@ def spread(
 ) -> Trajectory:
     """A batch (chains, K, ...) about a trajectory: itself, and smoothly perturbed copies.
 
-    Positions, activations and controls move by a random sum of the sines that are 0 at time 0 and
-    free at the end, velocities by what that takes. Nothing leaves the bounds.
+    To positions, activations and controls random sums of sines are added that are 0 at time 0, and
+    to velocities what follows from those of the positions. All stay within the bounds.
 
     Args:
         problem: whose bounds and scatter box are used.
@@ -188,8 +189,8 @@ def _rows(array: np.ndarray) -> np.ndarray:
 def _waves(rng: np.random.Generator, chains: int, K: int, size: int) -> np.ndarray:
     """Random functions of the knots 0..K, (chains, K + 1, size); those of the first chain are 0.
 
-    Sums of four sin((j - 1/2) pi k / K), j = 1..4, with standard deviations ~ 1 / j, which give 1
-    at k = K.
+    Sums of sin((j - 1/2) pi k / K), j = 1..4, with standard deviations in proportion to 1 / j. At
+    k = K the standard deviation of the sum is 1.
     """
     j = np.arange(1, 5)
     weights = rng.normal(size=(chains, 4, size)) / (j * np.linalg.norm(1 / j))[:, None]
@@ -198,13 +199,12 @@ def _waves(rng: np.random.Generator, chains: int, K: int, size: int) -> np.ndarr
 
 
 def _per_dof(model: mujoco.MjModel, widths: np.ndarray, turn: float) -> np.ndarray:
-    """Numbers for each dof (..., nv) from those for each of x (..., nx); `turn` for rotations."""
+    """Widths for the entries of qvel (..., nv) from those for x (..., nx); `turn` for rotations."""
     joint = model.dof_jntid
     place = np.arange(model.nv) - model.jnt_dofadr[joint]
     kind = model.jnt_type[joint]
-    free, ball = (kind == k for k in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
-    turns = ball | (free & (place >= 3))
-    return np.where(turns, turn, widths[..., model.jnt_qposadr[joint] + place])
+    rotates = (kind == BALL) | ((kind == FREE) & (place >= 3))
+    return np.where(rotates, turn, widths[..., model.jnt_qposadr[joint] + place])
 
 
 def _model(problem: Problem) -> mujoco.MjModel:

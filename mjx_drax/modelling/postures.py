@@ -1,7 +1,7 @@
-"""A task for any model: reach a posture that its actuators can bring it to, from its default state.
+"""A task for any model: reach a posture from its default state.
 
-The posture is where MuJoCo's C engine ends under smooth random controls within the model's limits,
-so it can be reached in the time that is given, if only passed through.
+In the posture MuJoCo's C engine ends under smooth random controls within the model's limits, so it
+can be reached in the given time, though perhaps not held.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from mjx_drax.physics.source import load, model_name
 from mjx_drax.physics.states import Engine, between
 from mjx_drax.problem.problem import Problem
 
-NEAR = 0.02
-"""Largest |qpos - posture|, in tangent space [rad, m], that reaches it."""
+TOLERANCE = 0.02
+"""Largest |qpos - posture|, in tangent space [rad, m], that counts as reached."""
 
-SHORTEST, NODES, DRAWS, SHRINK = 5, 4, 20, 0.7
-"""Knots of a motion at least; random controls that each is led through; motions that are tried, and
-what is left of the controls from each to the next."""
+LEAST_KNOTS, RANDOM_CONTROLS, TRIALS, SHRINK = 5, 4, 20, 0.7
+"""Least knots of a motion; random controls that a motion interpolates; most motions that are tried;
+and the factor on the controls from each of these to the next."""
 
 
 def reach(
@@ -51,13 +51,13 @@ def reach(
     x_init, bounded = checked_start(model, name)
     steps = steps_between_knots(model, None)
     dt, limits = steps * model.opt.timestep, control_ranges(model)
-    path = _motion(model, name, x_init, bounded, steps, max(SHORTEST, round(horizon / dt)), seed)
+    path = _motion(model, name, x_init, bounded, steps, max(LEAST_KNOTS, round(horizon / dt)), seed)
     target = path[-1, : model.nq]
     on = Terms(model)
     half = np.maximum(0.5 * (limits[1] - limits[0]), 1e-6)
 
     def goal(data: mujoco.MjData) -> bool:
-        return bool(np.abs(between(model, target, data.qpos)).max() < NEAR)
+        return bool(np.abs(between(model, target, data.qpos)).max() < TOLERANCE)
 
     return from_mjcf(
         model,
@@ -79,15 +79,15 @@ def _motion(
     knots: int,
     seed: int,
 ) -> np.ndarray:
-    """States (K + 1, nx), K <= knots, of the motion that stays in the joints' ranges longest."""
+    """States (K + 1, nx), K <= knots, of the motion that stays longest in the ranges of joints."""
     engine, rng, limits = Engine(model), np.random.default_rng(seed), control_ranges(model)
     where = model.jnt_qposadr[bounded]
     lower, upper = (end[bounded] for end in free_ranges(model))
     best, rest = x_init[None], np.clip(0.0, *limits)
-    for draw in range(DRAWS):
-        nodes = rest + SHRINK**draw * (rng.uniform(*limits, (NODES, model.nu)) - rest)
-        at = np.linspace(0, NODES - 1, knots)
-        controls = [np.interp(at, np.arange(NODES), column) for column in nodes.T]
+    for trial in range(TRIALS):
+        nodes = rest + SHRINK**trial * (rng.uniform(*limits, (RANDOM_CONTROLS, model.nu)) - rest)
+        at = np.linspace(0, RANDOM_CONTROLS - 1, knots)
+        controls = [np.interp(at, np.arange(RANDOM_CONTROLS), column) for column in nodes.T]
         path = [x_init]
         for u in np.stack(controls, axis=1):
             x = engine.step(path[-1], u, steps)
@@ -99,9 +99,9 @@ def _motion(
             best = np.stack(path)
         if len(best) > knots:
             return best
-    if len(best) <= SHORTEST:
+    if len(best) <= LEAST_KNOTS:
         raise DraxError(
-            f"{name} leaves the ranges of its joints within {SHORTEST} knots under any of {DRAWS} "
-            "random controls: give it a keyframe from which it can move."
+            f"{name} leaves the ranges of its joints within {LEAST_KNOTS} knots under any of "
+            f"{TRIALS} random controls: give it a keyframe from which it can move."
         )
     return best

@@ -5,7 +5,7 @@
 A `Term` is a function like those that a user writes, and goes where they go; `+` stacks residuals,
 of terms and of plain functions. Names are looked up when a term is made. Targets, weights, margins
 and sizes are traced numbers: another value does not recompile. A running residual is summed over
-the knots as it stands, so a weight per second is multiplied by dt by whoever gives it.
+the knots without a factor dt: for a weight per second, give the weight times dt.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.modelling.distances import DISTANCES, SPHERE, Shape
 from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.source import index, load
 from mjx_drax.problem.cost import as_partial
 
@@ -104,43 +105,29 @@ class Terms:
                 quaternion (4,) for a ball or a pose (7,) for a free joint.
         """
         model = self.model
-        joints = list(range(model.njnt))
-        qpos = np.array(model.qpos0)
+        named, qpos = None, np.array(model.qpos0)
         if isinstance(target, str):
             qpos = np.array(model.key_qpos[index(model, "keyframe", target)])
         elif isinstance(target, Mapping):
-            joints = self._indices("joint", target)
-            for joint, (name, value) in zip(joints, target.items(), strict=True):
+            named = list(target)
+            for joint, (name, value) in zip(
+                self._indices("joint", named), target.items(), strict=True
+            ):
                 at, size = model.jnt_qposadr[joint], _QPOS[model.jnt_type[joint]]
                 qpos[at : at + size] = _numbers(f"posture of {name!r}", value, size)
         else:
             qpos = _numbers("posture", target, model.nq)
-        differences: list[int] = []
-        quaternions: list[int] = []
-        order: list[tuple[bool, int]] = []  # (whether a rotation, its place among its kind)
-        for joint in joints:
-            at, kind = int(model.jnt_qposadr[joint]), model.jnt_type[joint]
-            plain = {_FREE: 3, _BALL: 0}.get(kind, 1)
-            order += [(False, len(differences) + i) for i in range(plain)]
-            differences += range(at, at + plain)
-            if kind in (_FREE, _BALL):
-                order += [(True, 3 * len(quaternions) + i) for i in range(3)]
-                quaternions.append(at + plain)
-                _unit("posture", qpos[at + plain : at + plain + 4])
-        places = [len(differences) * rotation + place for rotation, place in order]
-        where = (tuple(differences), tuple(quaternions), tuple(places))
-        return _term(_posture, where, (qpos,), "posture", len(places), weight)
+        joints = Joints.of(model)
+        for q, _ in joints.quaternions:
+            _unit("posture", qpos[q : q + 4])
+        at = self._dofs(named)
+        return _term(_posture, (joints, tuple(at)), (qpos,), "posture", len(at), weight)
 
     def velocity(
         self, joints: Names | None = None, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0
     ) -> Term:
         """qvel [rad/s, m/s] of all joints or of the named ones, against a target of its size."""
-        at: list[int] = list(range(self.model.nv))
-        if joints is not None:
-            at = []
-            for joint in self._indices("joint", joints):
-                start = int(self.model.jnt_dofadr[joint])
-                at += range(start, start + _QVEL[self.model.jnt_type[joint]])
+        at = self._dofs(joints)
         wanted = _numbers("target of velocity", target, len(at), alike=True)
         return _term(_read, ("qvel", tuple(at)), (wanted,), "velocity", len(at), weight)
 
@@ -216,8 +203,8 @@ class Terms:
     def clearance(self, geoms: Names, others: Names, *, margin: ArrayLike = 0.0) -> Term:
         """margin - distance [m], (n,), <= 0 where geoms keep their distance: an inequality.
 
-        One value for each of `geoms` with each of `others`, the latter running faster. Distances
-        are signed; `mjx_drax.distances` says for which pairs they are exact (all but two kinds).
+        One value for each of `geoms` with each of `others`, which vary fastest. Distances
+        are signed; `modelling.distances` says for which pairs they are exact (all but two kinds).
 
         Args:
             geoms: name or names.
@@ -272,6 +259,13 @@ class Terms:
             parts.append(_term(_orientation, (body,), (wanted, turned), label, 3, weights[-3:]))
         return parts[0] if len(parts) == 1 else parts[0] + parts[1]
 
+    def _dofs(self, joints: Names | None) -> list[int]:
+        """Places in qvel of all joints or of the named ones, in the order of the names."""
+        if joints is None:
+            return list(range(self.model.nv))
+        found = self._indices("joint", joints)
+        return [int(v) for joint in found for v in np.flatnonzero(self.model.dof_jntid == joint)]
+
     def _indices(self, kind: str, names: Names) -> list[int]:
         listed = [names] if isinstance(names, str) or not isinstance(names, Iterable) else names
         found = [index(self.model, kind, name) for name in listed]
@@ -280,9 +274,7 @@ class Terms:
         return found
 
 
-_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
-_QPOS = np.array([7, 4, 1, 1])  # numbers in a free, ball, slide and hinge joint's position
-_QVEL = np.array([6, 3, 1, 1])
+_QPOS = np.array([7, 4, 1, 1])  # numbers in the position of a free, ball, slide and hinge joint
 
 
 # The residuals: functions of data, control, addresses and numbers
@@ -301,12 +293,8 @@ def _control(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) 
 
 
 def _posture(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
-    differences, quaternions, places = (np.array(part, int) for part in where)
-    parts = [data.qpos[differences] - target[differences]]
-    if len(quaternions):
-        at = quaternions[:, None] + np.arange(4)
-        parts.append(quaternion.between(target[at], data.qpos[at]).ravel())
-    return jnp.concatenate(parts)[places]
+    joints, at = where
+    return joints.difference(data.qpos, target)[np.array(at)]
 
 
 def _orientation(

@@ -1,7 +1,7 @@
 """Contacts of MJX, with boxes on planes as MuJoCo's C engine has them.
 
-MJX makes contacts where corners of a box are within 1 mm of the lowest, so that a box that leans
-stands on fewer of them than in the C engine, which takes all corners in the lower half.
+MJX makes contacts at the corners of a box that are within 1 mm of the lowest one. The C engine
+takes all corners of the lower half, so that a tilted box has more contacts there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mjx_drax.physics._mjx import COLLISIONS, make_frame, mjx
 from mjx_drax.physics.engine import mujoco
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-"""Of a cube, (8, 3)."""
+"""The corners of a cube, (8, 3)."""
 
 _PLANE_BOX = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)
 _ONE_AT_A_TIME = threading.Lock()
@@ -27,7 +27,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 def collision(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.collision`: `data` with all contacts."""
-    with _ONE_AT_A_TIME:  # MJX has one table of functions, which is left as it was
+    with _ONE_AT_A_TIME:  # MJX has one table of functions for all threads; it is restored
         before = COLLISIONS[_PLANE_BOX]
         COLLISIONS[_PLANE_BOX] = plane_box
         try:
@@ -40,11 +40,11 @@ def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> tuple[Ar
     """Distances (4 n,), positions (4 n, 3) and frames (4 n, 3, 3) of contacts of pairs (n, 2)."""
     plane, box = geom.T
     normal = data.geom_xmat[plane][:, None, :, 2]
-    turned = jnp.sum(
+    from_centre = jnp.sum(
         data.geom_xmat[box][:, None] * (CORNERS * model.geom_size[box][:, None])[:, :, None],
         axis=-1,
     )
-    corners = data.geom_xpos[box][:, None] + turned
+    corners = data.geom_xpos[box][:, None] + from_centre
     height = jnp.sum((corners - data.geom_xpos[plane][:, None]) * normal, axis=-1)
     _, lowest = jax.lax.top_k(-height, 4)
     dist = jnp.take_along_axis(height, lowest, axis=1)
@@ -53,4 +53,4 @@ def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> tuple[Ar
     return dist.reshape(-1), pos.reshape(-1, 3), frame
 
 
-plane_box.ncon = 4  # type: ignore[attr-defined]  # how MJX knows
+plane_box.ncon = 4  # type: ignore[attr-defined]  # contacts of a pair, which MJX reads

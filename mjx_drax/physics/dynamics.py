@@ -164,7 +164,7 @@ class MjxDynamics(Dynamics):
         return self.model.nq + self.model.nv + self.model.na
 
     @property
-    def ndx(self) -> int:  # type: ignore[override]
+    def ndx(self) -> int:
         """2 nv + na: one less than nx for every ball or free joint."""
         return 2 * self.model.nv + self.model.na
 

@@ -1,8 +1,8 @@
 """States x = [qpos, qvel, act] of a model, and their tangent space [dq (nv), dv (nv), da (na)].
 
-Hinges and slides add. Ball and free joints hold unit quaternions: qpos has a number more than the
-tangent for each, and rotations compose (`quaternion`). A free joint's translation adds, in the
-world's frame. These are the conventions of MuJoCo's `mj_integratePos` and `mj_differentiatePos`.
+Positions of hinges and slides add. Ball and free joints hold unit quaternions: for each, qpos has
+one number more than the tangent, and rotations compose (`quaternion`). Translations of free joints
+add, in the frame of the world. `mj_integratePos` and `mj_differentiatePos` of MuJoCo do the same.
 """
 
 from __future__ import annotations
@@ -16,16 +16,18 @@ from jax import Array
 from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
 
-_BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
+FREE, BALL, SLIDE, HINGE = (
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE")
+)
 
 
 @dataclass(frozen=True)
 class Joints:
-    """Where the quaternions of qpos stand, which is all that tells states from vectors.
+    """Which entries of qpos are quaternions: all other entries of a state add.
 
     Attributes:
         nq, nv: sizes of qpos and qvel.
-        quaternions: (address in qpos, address in qvel) of each, ascending.
+        quaternions: (address in qpos, address in qvel) of each, in ascending order.
     """
 
     nq: int
@@ -35,7 +37,7 @@ class Joints:
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Joints:
         """The joints of a model, MuJoCo's or MJX's."""
-        shift = {_BALL: 0, _FREE: 3}  # a free joint's translation comes first
+        shift = {BALL: 0, FREE: 3}  # a free joint's translation comes first
         quaternions = [
             (int(q) + shift[int(kind)], int(v) + shift[int(kind)])
             for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True)
@@ -44,7 +46,7 @@ class Joints:
         return cls(int(model.nq), int(model.nv), tuple(sorted(quaternions)))
 
     def _parts(self) -> list[tuple[slice, slice, bool]]:
-        """Parts of qpos and of its tangent, and whether they are a quaternion's."""
+        """Slices of qpos and of its tangent, and whether they are those of a quaternion."""
         parts, q, v = [], 0, 0
         for at_q, at_v in self.quaternions:
             parts += [(slice(q, at_q), slice(v, at_v), False)]
@@ -53,9 +55,9 @@ class Joints:
         return [*parts, (slice(q, self.nq), slice(v, self.nv), False)]
 
     def integrate(self, x: Array, dx: Array) -> Array:
-        """x + dx, for x beginning with qpos (nq,) and dx with its tangent vector (nv,).
+        """x + dx, where x begins with qpos (nq,) and dx with its tangent vector (nv,).
 
-        What follows, velocities and activations, adds.
+        Velocities and activations, which follow, add.
         """
         if not self.quaternions:
             return x + dx
@@ -84,9 +86,9 @@ class Joints:
         return x
 
     def tangent(self, numbers: Array) -> Array:
-        """Of numbers (..., nx) that go with the entries of x, those of the tangent (..., ndx).
+        """Numbers (..., ndx) for the entries of a tangent, from those for entries of x, (..., nx).
 
-        Rotation vectors, whose axes are not entries of x, get zeros.
+        Rotation vectors get zeros, because their entries have no counterpart in x.
         """
         if not self.quaternions:
             return numbers

@@ -21,7 +21,7 @@ from mjx_drax.physics.checks import (
 )
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.joints import HINGE, Joints
 from mjx_drax.physics.mjx_model import free_ranges, kept_contacts, put_model
 from mjx_drax.physics.source import load, model_name, origin_of
 from mjx_drax.problem.build import assembled, knots, require_name, scatter_box
@@ -64,7 +64,7 @@ def from_mjcf(
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
         horizon: duration [s]; K = horizon / dt knots, rounded.
-        running_cost: l(data, u), a scalar, summed over the knots as it stands.
+        running_cost: l(data, u), a scalar, summed over the knots without a factor dt.
         terminal_cost: phi(data), a scalar.
         running_residual: r(data, u) (n,): adds 1/2 |r|^2 to the running cost.
         terminal_residual: r(data) (n,): adds 1/2 |r|^2 to the terminal cost.
@@ -79,17 +79,17 @@ def from_mjcf(
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
-            +-5 (rad/s or m/s) for velocities about x_init. Every second chain then starts nearer to
-            x_init, some more than others. Where contacts, limits or dry friction act, or states
-            hold quaternions, all do, also with a box given here: see `Problem.draw`.
+            +-5 (rad/s or m/s) for velocities about x_init. Half of the chains then start closer to
+            x_init, by random factors. Where contacts, limits or dry friction act, or states hold
+            quaternions, all do, also with a box given here: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the
-            nearest ones in every state. True keeps all where there are at most 32, else 32. False
-            plans as if nothing could touch, which is right where constraints keep things apart. The
-            C engine that certifies keeps all its contacts.
+            nearest ones in every state. True keeps at most 32. False plans as if nothing could
+            touch, which is right where constraints keep bodies apart. The C engine that certifies
+            keeps all contacts.
         derivatives: of f; by default exact, also in contact. `Smoothed()` fits them to samples,
-            which feel a contact from as far as they are drawn.
+            which feel a contact that is as far away as the samples are spread.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
         guess: guess(key) -> Trajectory, instead of the scatter boxes.
         name: used in files and tables; by default the model's name.
@@ -168,7 +168,7 @@ def _scatter(
         hold = np.clip(inverse_dynamics(model, held, dynamics.dt, rest)[0], *ends)
         u = hold - width, hold + width
     positions = np.ones(model.nq)
-    positions[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = np.pi
+    positions[model.jnt_qposadr[model.jnt_type == HINGE]] = np.pi
     positions[dynamics.joints.is_quaternion] = 0.3
     half = np.concatenate([positions, np.full(model.nv, 5.0), np.ones(model.na)])
     return scatter_box(bounds, jnp.asarray(x_init), jnp.asarray(half), x, u)

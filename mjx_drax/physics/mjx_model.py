@@ -19,6 +19,7 @@ from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.physics._mjx import geom_pairs, has_collision_fn, internal, mjx
 from mjx_drax.physics.actuators import disabled, driven
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.joints import HINGE, SLIDE
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
@@ -352,11 +353,10 @@ def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
     """Joints whose range becomes a bound on knots, (njnt,).
 
-    Those are hinges and slides that an actuator drives and that start inside their range. What
-    rests on its limit, or starts beyond it, needs the limit's force: it stays in the dynamics.
+    Those are hinges and slides that an actuator drives and that start inside of their range. Where
+    a joint rests on its limit, or starts beyond it, the limit's force must stay in the dynamics.
     """
-    kinds = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
-    single = np.isin(model.jnt_type, [int(kind) for kind in kinds]) & (model.jnt_limited != 0)
+    single = np.isin(model.jnt_type, (SLIDE, HINGE)) & (model.jnt_limited != 0)
     start = x_init[model.jnt_qposadr]
     lower, upper = free_ranges(model)
     return single & driven(model) & (start > lower) & (start < upper)

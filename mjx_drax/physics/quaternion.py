@@ -2,9 +2,10 @@
 
     exp(v) = [cos(|v|/2), sin(|v|/2) v/|v|]        log(exp(v)) = v for |v| < pi
 
-A state is displaced in its own frame, q exp(v), as MuJoCo does it: an angular velocity times dt is
-such a v. Both maps are smooth at the identity, which is where every feasible defect sits. MJX's own
-conversions divide by a norm that is cut off there, and their derivatives vanish or are NaN.
+A rotation vector moves a quaternion in its own frame, q exp(v), as in MuJoCo: an angular velocity
+times dt is such a v. Both maps are smooth at the identity, where the defects of a feasible
+trajectory are. MJX's own conversions divide by a norm that is cut off there, and their derivatives
+are zero or NaN.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 
 SMALL = 1e-6
-"""Squared half-angle [rad^2] below which series replace quotients; rounding hides the difference
-in float32 and leaves 1e-13 in float64."""
+"""Squared half-angle [rad^2] below which series replace quotients; the difference is below rounding
+in float32 and 1e-13 in float64."""
 
 
 def multiply(p: Array, q: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What becomes of a model, and how far MJX is from MuJoCo's C engine in it: `mjx-drax check`."""
+"""What is planned with for a model, and how far MJX is from MuJoCo's C engine: `mjx-drax check`."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _agreement(model: mujoco.MjModel, x_init: np.ndarray, bounded: np.ndarray) -
 
 
 def _joints(model: mujoco.MjModel, bounded: np.ndarray) -> list[Report]:
-    """What becomes of every joint."""
+    """Every joint: what drives it, and whether its range is a bound or a limit in the dynamics."""
     pulls, found = largest_moment_arms(model) > 0, []
     for j in range(model.njnt):
         limited = bool(model.jnt_limited[j])

@@ -1,16 +1,16 @@
 """One step of MJX, with derivatives that hold at rest and in contact.
 
-Five things differ from `mjx.step`, all but the last not in value:
+Five things differ from `mjx.step`. Only the last one changes values:
 
 - Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
-  acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), whose law s is MJX's. Newton's method
-  finds the minimum a* without tangents, and one more Newton step, a* - H^{-1} grad(a*), carries
-  them: where grad = 0 its derivative is the implicit function theorem's, da = -H^{-1} d grad.
+  acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), with the function s of MJX. Newton's method
+  finds the minimum a* without derivatives. One more Newton step, a* - H^{-1} grad(a*), has them:
+  where grad = 0 its derivative is that of the implicit function theorem, da = -H^{-1} d grad.
 - Positions are integrated by `joints`, whose quaternions have derivatives at rest. The
-  semi-implicit integrators end with this, so only the end is replaced; Runge-Kutta integrates at
-  every stage and is written out.
-- The forces of springs on ball and free joints go through the same quaternions.
-- What adds up along the tree of bodies is computed without walking along it, by `tree`, and the
+  semi-implicit integrators end with this, so only their end is replaced; Runge-Kutta integrates at
+  every stage and is written here.
+- The forces of springs on ball and free joints use the same quaternions.
+- Sums along the tree of bodies are computed by `tree`, without a loop over its levels, and the
   inertia M is dense and factorized by `linalg`.
 - Boxes on planes have the contacts of the C engine; see `collision`.
 """
@@ -30,21 +30,20 @@ from mjx_drax.kernels.linalg import cholesky, solve, symmetric
 from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
 from mjx_drax.physics.collision import collision
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.joints import BALL, FREE, Joints
 from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
 
-TURNING = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
-
 ITERATIONS, SIZES = 20, 8
-"""Newton's method for constraint forces: iterations at most, and step sizes that it chooses from,
-each half the one before."""
+"""Newton's method for constraint forces: most iterations, and how many step sizes it chooses from,
+1, 1/2, 1/4, ..."""
 
-SLIGHT = 1e-3
-"""Share of the decrease that a step promised, below which another would be no use: in float32, or
-where constraints are about to switch, costs go on falling by next to nothing."""
+LEAST_SHARE = 1e-3
+"""Least share of its predicted decrease that a step must achieve for another one to follow. In
+float32, or where constraints are about to switch, costs go on decreasing by almost nothing."""
 
 RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
-"""Of each stage: how far it goes along the last stage's rate, and its weight in the sum."""
+"""Of each stage: the share of the timestep that it goes along the rate of the stage before, and its
+weight in the sum of rates."""
 
 
 def state(data: mjx.Data) -> Array:
@@ -59,12 +58,12 @@ def data_at(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
 
 
 def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
-    """Everything that follows from a state (nx,) and a control (nu,): positions to accelerations.
+    """`mjx.forward`: all that follows from a state (nx,) and a control (nu,), up to accelerations.
 
-    What the caller does not read is not computed, once this is compiled.
+    Compiled functions compute only what their caller reads.
     """
     data = data_at(model, x, u)
-    turned = np.isin(model.jnt_type, TURNING)
+    turned = np.isin(model.jnt_type, (FREE, BALL))
     if turned.any():
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
         model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
@@ -75,7 +74,7 @@ def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
 
 
 def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_position`, without its walks along the tree and factors of M."""
+    """`mjx.fwd_position`, with the sums along the tree of `tree`, and without factors of M."""
     data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
     data = mass_matrix(model, mjx.tendon(model, data))
     data = collision(model, mjx.tendon_armature(model, data))
@@ -83,7 +82,7 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_velocity`, without its walks along the tree."""
+    """`mjx.fwd_velocity`, with the sums along the tree of `tree`."""
     data = with_internal(
         data,
         actuator_velocity=internal(data).actuator_moment @ data.qvel,
@@ -94,7 +93,7 @@ def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_acceleration`: `data` with the acceleration that constraints do not change."""
+    """`mjx.fwd_acceleration`: `data` with the acceleration without constraints."""
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
     force = force + data.qfrc_applied + mjx.xfrc_accumulate(model, data)
     qacc = solve(cholesky(internal(data).M), force)
@@ -102,19 +101,19 @@ def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
-    """Forces (nv,) of the springs of ball and free joints, which are those `turned`, (njnt,)."""
+    """Forces (nv,) of the springs of ball and free joints, where `turned` is true, (njnt,)."""
     away = Joints.of(model).difference(qpos, model.qpos_spring)
     stiffness = jnp.where(turned, model.jnt_stiffness, 0.0)
     return -stiffness[model.dof_jntid] * away
 
 
 def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`data` with the acceleration and forces that constraints leave."""
+    """`data` with the acceleration and the forces under constraints."""
     if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
 
     def law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, ConstraintForces]:
-        """The slope of what the acceleration minimizes, (nv,), and constraint forces."""
+        """The gradient (nv,) of what the acceleration minimizes, and constraint forces."""
         forces = ConstraintForces.create(model, data.replace(qacc=qacc), grad=False)
         return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
@@ -136,28 +135,28 @@ def _minimum(
     hessian: Callable[[Array], Array],
     start: Array,
 ) -> Array:
-    """The acceleration (nv,) where the slope of `law` is zero, to rounding, by Newton's method.
+    """The acceleration (nv,) where the gradient of `law` is zero, to rounding, by Newton's method.
 
-    The function is piecewise quadratic where friction cones are pyramids: once the step knows which
-    constraints are active it ends at the minimum. Before, a shorter step may be better.
+    The function is piecewise quadratic where friction cones are pyramids. Once the constraints that
+    are active stay the same, a full step ends at the minimum; before, a shorter one may be better.
     """
     sizes = 0.5 ** jnp.arange(SIZES)
 
     def newton(carry: Any) -> Any:
-        count, _, qacc, slope, cost = carry
-        direction = solve(cholesky(hessian(qacc)), slope)
+        count, _, qacc, gradient, cost = carry
+        direction = solve(cholesky(hessian(qacc)), gradient)
         tries = qacc - sizes[:, None] * direction
-        slopes, forces = jax.vmap(law)(tries)
+        gradients, forces = jax.vmap(law)(tries)
         best = jnp.argmin(forces.cost)
         rounding = jnp.finfo(cost.dtype).eps * jnp.abs(cost)
-        least = jnp.maximum(rounding, SLIGHT * jnp.dot(slope, direction))
+        least = jnp.maximum(rounding, LEAST_SHARE * jnp.dot(gradient, direction))
         better = cost - forces.cost[best] > least
-        found = tries[best], slopes[best], forces.cost[best]
-        kept = jax.tree.map(partial(jnp.where, better), found, (qacc, slope, cost))
+        found = tries[best], gradients[best], forces.cost[best]
+        kept = jax.tree.map(partial(jnp.where, better), found, (qacc, gradient, cost))
         return count + 1, better, *kept
 
-    slope, forces = law(start)
-    begin = jnp.array(0), jnp.array(True), start, slope, forces.cost
+    gradient, forces = law(start)
+    begin = jnp.array(0), jnp.array(True), start, gradient, forces.cost
     end: Any = jax.lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], newton, begin)
     return end[2]
 
@@ -174,17 +173,17 @@ def step(model: mjx.Model, x: Array, u: Array) -> Array:
 
 
 def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
-    """The acceleration (nv,) that treats forces that fall with velocity implicitly."""
+    """The acceleration (nv,) of an integrator that treats damping implicitly."""
     h = model.opt.timestep
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
             return data.qacc
-        fall = -jnp.diag(model.dof_damping)
+        by_velocity = -jnp.diag(model.dof_damping)
     else:
-        fall = mjx.deriv_smooth_vel(model, data)
-        if fall is None:
+        by_velocity = mjx.deriv_smooth_vel(model, data)
+        if by_velocity is None:
             return data.qacc
-    M = symmetric(internal(data).M - h * fall)
+    M = symmetric(internal(data).M - h * by_velocity)
     return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
 
 
@@ -203,6 +202,6 @@ def _runge_kutta(model: mjx.Model, joints: Joints, x: Array, u: Array) -> Array:
     moved = joints.integrate(x, h * total)
     if model.na == 0:
         return moved
-    # Activations have rules of their own (exact filters, ranges), which Euler's step knows
+    # Activations are integrated as in MuJoCo's Euler step, with exact filters and their ranges
     data = forward(model, x, u).replace(act_dot=total[2 * model.nv :])
     return moved.at[model.nq + model.nv :].set(mjx.euler(model, data).act)

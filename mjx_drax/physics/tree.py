@@ -1,17 +1,18 @@
-"""Kinematics and smooth dynamics of a tree of bodies, without a walk along the tree.
+"""Kinematics and smooth dynamics of a tree of bodies, without a loop over its levels.
 
-MJX walks: it repeats the same few operations for every level of the tree and every kind of joint,
-and compilers need time in proportion. (GPUs' need more: they fuse what a level needs into each of
-its readers, again and again.) Here each is written once, for all joints or bodies.
+MJX loops: it repeats the same few operations for every level of the tree and every kind of joint,
+and the time to compile grows with them. (On GPUs it grows faster, because compilers copy what a
+level computes into all that reads it.) Here each operation is written once, for all joints or
+bodies at once.
 
-Frames are composed by doubling: each knows its place in an ancestor's; composed with that of the
-ancestor, it knows its place in one twice as far up. After log2(depth) rounds that is the world.
+Frames are composed by doubling: each frame is given in one of its ancestors; composed with that
+ancestor's, it is given in one twice as far up. After log2(depth) rounds it is given in the world.
 Velocities, accelerations, forces and inertias add up along the tree. With S[b, d] = 1 where degree
-of freedom d moves body b, and else 0, sums over what is above are products with S, and sums over
-what is below with its transpose.
+of freedom d moves body b, and 0 elsewhere, sums over all that is above a body are products with S,
+and sums over all that is below it are products with S'.
 
-Products of small matrices are sums of three terms: compilers fuse these, but neither reductions nor
-calls of a library.
+Products of small matrices are written as sums of three terms, because compilers fuse sums, but
+neither reductions nor calls of a library.
 """
 
 from __future__ import annotations
@@ -26,23 +27,19 @@ from jax.typing import ArrayLike
 
 from mjx_drax.physics._mjx import internal, mjx, with_internal
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.joints import BALL, FREE, HINGE, SLIDE, Joints
 from mjx_drax.physics.quaternion import matrix, multiply, normalized
-
-_FREE, _BALL, _SLIDE, _HINGE = (
-    int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("FREE", "BALL", "SLIDE", "HINGE")
-)
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """The frames that are composed: the world's, one after each joint, one of each other body.
+    """The frames that are composed: the world, one a joint, and one a body that has no joints.
 
     Attributes:
-        parents: the frame that each is in at first, (n,).
-        bodies: whose offset comes first in each, or nbody for none, (n,).
-        joints: whose motion follows, or njnt for none, (n,).
-        last: of each body, (nbody,).
+        parents: the frame that each is given in, (n,).
+        bodies: the body whose offset each begins with, (n,); nbody for none.
+        joints: the joint whose motion follows, (n,); njnt for none.
+        last: the frame that is the body's, (nbody,).
     """
 
     parents: np.ndarray
@@ -52,14 +49,14 @@ class _Frames:
 
     @classmethod
     def of(cls, model: mjx.Model) -> _Frames:
-        """Those of a model."""
-        none, still = model.nbody, model.njnt
-        found, last = [(0, none, still)], [0]
+        """The frames of a model."""
+        none, fixed = model.nbody, model.njnt
+        found, last = [(0, none, fixed)], [0]
         for body in range(1, model.nbody):
             frame, offset = last[model.body_parentid[body]], body
             start, count = model.body_jntadr[body], model.body_jntnum[body]
-            for joint in range(start, start + count) if count else [still]:
-                free = joint < still and model.jnt_type[joint] == _FREE
+            for joint in range(start, start + count) if count else [fixed]:
+                free = joint < fixed and model.jnt_type[joint] == FREE
                 found.append((frame, none if free else offset, joint))
                 frame, offset = len(found) - 1, none
             last.append(frame)
@@ -77,7 +74,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         offset = offset.at[mocap].set(data.mocap_pos[which])
         tilt = tilt.at[mocap].set(normalized(data.mocap_quat[which]))
     slides, turns = _slides(model, data.qpos), _turns(model, data.qpos)
-    pivots = jnp.where(kinds[:, None] == _FREE, 0.0, model.jnt_pos)
+    pivots = jnp.where(kinds[:, None] == FREE, 0.0, model.jnt_pos)
     move = _padded(slides + pivots - _applied(turns, pivots), 0.0)[frames.joints]
     turn = _padded(turns, jnp.eye(3))[frames.joints]
     offsets = _padded(offset, 0.0)[frames.bodies]
@@ -87,12 +84,12 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     after = np.array([np.flatnonzero(frames.joints == j)[0] for j in range(model.njnt)], int)
     axes = model.jnt_axis
-    if (kinds == _BALL).any():  # an axis is that before its joint turns, which only a ball's feels
+    if (kinds == BALL).any():  # MuJoCo's axis is that before the joint turns; only balls turn it
         before = _applied(jnp.swapaxes(turns, 1, 2), axes)
-        axes = jnp.where(kinds[:, None] == _BALL, before, axes)
+        axes = jnp.where(kinds[:, None] == BALL, before, axes)
     xaxis = _applied(mat[after], axes)
-    xaxis = jnp.where(kinds[:, None] == _FREE, jnp.array([0.0, 0.0, 1.0]), xaxis)
-    slid = jnp.where(kinds[:, None] == _SLIDE, slides, 0.0)
+    xaxis = jnp.where(kinds[:, None] == FREE, jnp.array([0.0, 0.0, 1.0]), xaxis)
+    slid = jnp.where(kinds[:, None] == SLIDE, slides, 0.0)
     xpos, xmat = pos[frames.last], mat[frames.last]
 
     def placed(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
@@ -122,7 +119,7 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.com_pos`: `data` with centres of mass, inertias and motions about them.
 
     subtree_com (nbody, 3); cinert (nbody, 10) and cdof (nv, 6), about the centre of mass of all
-    that hangs on the same body of the world; motions are turning first, then moving.
+    bodies of the same kinematic tree; motions are [angular, linear].
     """
     inside = _Sums.of(model).subtrees
     mass = model.body_mass[:, None]
@@ -139,10 +136,10 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
     kinds, joint, body = np.asarray(model.jnt_type), model.dof_jntid, model.dof_bodyid
     kind, within = kinds[joint], np.arange(model.nv) - np.asarray(model.jnt_dofadr)[joint]
-    moves = (kind == _SLIDE) | ((kind == _FREE) & (within < 3))
+    moves = (kind == SLIDE) | ((kind == FREE) & (within < 3))
     turns = data.xmat[body, :, within % 3]  # columns of a matrix: the body's own axes
-    axes = jnp.where((kind == _FREE)[:, None] & moves[:, None], jnp.eye(3)[within % 3], turns)
-    axes = jnp.where(np.isin(kind, (_SLIDE, _HINGE))[:, None], data.xaxis[joint], axes)
+    axes = jnp.where((kind == FREE)[:, None] & moves[:, None], jnp.eye(3)[within % 3], turns)
+    axes = jnp.where(np.isin(kind, (SLIDE, HINGE))[:, None], data.xaxis[joint], axes)
     swept = jnp.cross(axes, about[body] - data.xanchor[joint])
     turning = jnp.where(moves[:, None], 0.0, axes)
     cdof = jnp.concatenate([turning, jnp.where(moves[:, None], axes, swept)], axis=1)
@@ -152,8 +149,8 @@ def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def mass_matrix(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.crb`: `data` with the joint-space inertia M, dense (nv, nv).
 
-    M[i, j] = cdof_j . I_i cdof_i for a degree of freedom j that moves what i moves, with I_i the
-    inertia of all of that.
+    M[i, j] = cdof_j . I_i cdof_i for a degree of freedom j that moves all that i moves, with I_i
+    the inertia of all that i moves.
     """
     sums = _Sums.of(model)
     moved = _inertia_times(_summed(sums.moves.T, internal(data).cinert), data.cdof)
@@ -188,9 +185,9 @@ class _Sums:
     """Which rows add up, as matrices of zeros and ones.
 
     Attributes:
-        moves: S, degrees of freedom that move a body, (nbody, nv).
-        before: those that move a degree of freedom's axis, (nv, nv).
-        subtrees: bodies that hang on a body, itself included, (nbody, nbody).
+        moves: S, which degrees of freedom move a body, (nbody, nv).
+        before: which degrees of freedom move the axis of another, (nv, nv).
+        subtrees: which bodies a body carries, itself included, (nbody, nbody).
     """
 
     moves: np.ndarray
@@ -199,15 +196,15 @@ class _Sums:
 
     @classmethod
     def of(cls, model: mjx.Model) -> _Sums:
-        """Those of a model."""
+        """The sums of a model."""
         subtrees = np.eye(model.nbody)
         for body in reversed(range(1, model.nbody)):
             subtrees[model.body_parentid[body]] += subtrees[body]
         moves = subtrees[np.asarray(model.dof_bodyid, int)].T
-        # On the same body, earlier joints count; of a free one its moving, for its turning
+        # On the same body, earlier joints; in a free joint, translations come before rotations
         joint, dof = np.asarray(model.dof_jntid, int), np.arange(model.nv)
         begins = np.asarray(model.jnt_dofadr, int)[joint]
-        free = np.asarray(model.jnt_type, int)[joint] == _FREE
+        free = np.asarray(model.jnt_type, int)[joint] == FREE
         begins = np.where(free, np.where(dof < begins + 3, 0, begins + 3), begins)
         before = moves[np.asarray(model.dof_bodyid, int)] * (dof < begins[:, None])
         return cls(moves, before, subtrees)
@@ -249,16 +246,16 @@ def _of_kind(model: mjx.Model, *kinds: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _slides(model: mjx.Model, qpos: Array) -> Array:
     """How far each joint has slid along its axis, a free one in the world, (njnt, 3)."""
-    (free, begins), (slide, at) = _of_kind(model, _FREE), _of_kind(model, _SLIDE)
+    (free, begins), (slide, at) = _of_kind(model, FREE), _of_kind(model, SLIDE)
     slid = model.jnt_axis[slide] * (qpos - model.qpos0)[at, None]
-    still, _ = _of_kind(model, _BALL, _HINGE)
+    still, _ = _of_kind(model, BALL, HINGE)
     floated = qpos[begins[:, None] + np.arange(3)]
     return _sorted([(free, floated), (slide, slid), (still, jnp.zeros((len(still), 3)))])
 
 
 def _turns(model: mjx.Model, qpos: Array) -> Array:
     """How each joint has turned, a free one in the world, (njnt, 3, 3)."""
-    hinge, at = _of_kind(model, _HINGE)
+    hinge, at = _of_kind(model, HINGE)
     angle, axis = (qpos - model.qpos0)[at, None, None], model.jnt_axis[hinge, None]
     along = axis * jnp.swapaxes(axis, 1, 2)
     across, skew = jnp.eye(3) - along, jnp.cross(jnp.eye(3), axis)
@@ -269,7 +266,7 @@ def _turns(model: mjx.Model, qpos: Array) -> Array:
 def _quaternions(model: mjx.Model, qpos: Array, tilt: Array, frames: _Frames) -> Array:
     """Of the bodies in the world, (nbody, 4); MJX itself reads hardly any."""
     identity = jnp.array([1.0, 0.0, 0.0, 0.0])
-    hinge, at = _of_kind(model, _HINGE)
+    hinge, at = _of_kind(model, HINGE)
     half = 0.5 * (qpos - model.qpos0)[at, None]
     spun = jnp.concatenate([jnp.cos(half), jnp.sin(half) * model.jnt_axis[hinge]], axis=1)
     turns = _merged(model, qpos, lambda quat: quat, identity, spun)
@@ -288,8 +285,8 @@ def _merged(
     of_hinges: Array,
 ) -> Array:
     """Rotations (njnt, ...) of all joints, from those of hinges and of quaternions in qpos."""
-    (free, begins), (ball, at) = _of_kind(model, _FREE), _of_kind(model, _BALL)
-    (slide, _), (hinge, _) = _of_kind(model, _SLIDE), _of_kind(model, _HINGE)
+    (free, begins), (ball, at) = _of_kind(model, FREE), _of_kind(model, BALL)
+    (slide, _), (hinge, _) = _of_kind(model, SLIDE), _of_kind(model, HINGE)
     at = np.concatenate([begins + 3, at])[:, None] + np.arange(4)
     turning = of_quaternion(normalized(qpos[at]))
     still = jnp.broadcast_to(identity, (len(slide), *identity.shape))

@@ -20,7 +20,6 @@ from mjx_drax import (
     solve,
 )
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.physics import mjcf
 from mjx_drax.solution import load as loading
 from mjx_drax.solution import save as results
 from mjx_drax.view.plotting import plot_solution
@@ -83,7 +82,7 @@ def test_a_model_comes_back_and_can_be_filmed(slider, folder, tmp_path):
     again = Solution.load(tmp_path / "elsewhere")
     model, before = (s.problem.dynamics.mj_model for s in (again, slider))
     np.testing.assert_array_equal(model.mesh_vert, before.mesh_vert)
-    assert again.problem.dynamics.host.source() == slider.problem.dynamics.host.source()
+    assert again.problem.dynamics.source() == slider.problem.dynamics.source()
     assert again.problem.dynamics.contacts == slider.problem.dynamics.contacts
     assert render(again, tmp_path / "film.mp4", fps=2, size=(64, 64)).stat().st_size > 500
 
@@ -172,7 +171,7 @@ def test_another_version_of_mujoco_compiles_the_mjcf_again(slider, folder, monke
         rtol=1e-5,
     )
     dynamics = slider.problem.dynamics
-    unknown = replace(dynamics, host=mjcf.HostModel(dynamics.mj_model))
+    unknown = replace(dynamics, origin=None)
     replace(slider, problem=replace(slider.problem, dynamics=unknown)).save(folder)
     assert Solution.load(folder).certified
     rewritten(folder, versions={**versions, "mujoco": "3.0.0"})
