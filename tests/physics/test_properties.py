@@ -29,7 +29,7 @@ def test_any_text_is_a_model_or_a_complaint(text, xml):
     outcome(lambda: load("<" * xml + text))
 
 
-@settings(bounded, max_examples=250)
+@settings(bounded, max_examples=150)
 @given(data=st.data())
 def test_a_garbled_model_is_a_model_or_a_complaint(data):
     text = arm()
