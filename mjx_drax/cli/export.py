@@ -17,16 +17,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the files beside the result."""
-    names = exports.chosen(options)
-    if not names:
-        flags = ", ".join(f"--{name}" for name in exports.EXPORTS)
-        raise DraxError(f"nothing to write: give at least one of {flags}.")
+    wanted = exports.chosen(options)
+    if not wanted:
+        flags = ", ".join(f"--{name}" for name in exports.exporters())
+        raise DraxError(f"nothing to write: give at least one of {flags} or --export.")
     from mjx_drax.solution.save import writable
     from mjx_drax.solution.solution import Solution
 
     solution = Solution.load(options.folder)
-    exports.require(solution.problem, names)
+    for each in wanted:
+        each.check(solution.problem)
     folder = writable(options.folder)
-    written = exports.write(solution, folder, names, say)
+    written = exports.write(solution, folder, wanted, say)
     say(f"written to {folder}/: {', '.join(written)}")
     return 0

@@ -23,7 +23,7 @@ NAMES = (
 def film_path(asked: str, folder: Path) -> Path:
     """Where a film goes, "" being the usual place; refuses a place that cannot be written."""
     from mjx_drax.base.files import require_room
-    from mjx_drax.view.video import film_path as checked
+    from mjx_drax.view.frames import video_path as checked
 
     film = checked(asked or folder / "film.mp4")
     require_room(film)
@@ -32,8 +32,8 @@ def film_path(asked: str, folder: Path) -> Path:
 
 def write_plots(solution: Solution, folder: Path, draw: Any) -> list[str]:
     """Plots of a solution; returns the files' names."""
+    from mjx_drax.view.phase_plots import has_phases, plot_multipliers, plot_phase
     from mjx_drax.view.plotting import plot_optima, plot_solution
-    from mjx_drax.view.portraits import has_phases, plot_multipliers, plot_phase
 
     plot_solution(solution, folder / "plot.png", draw=draw)
     plot_multipliers(solution, folder / "multipliers.png")
@@ -50,8 +50,8 @@ def write_plots(solution: Solution, folder: Path, draw: Any) -> list[str]:
 def write_video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any]) -> list[str]:
     """The motion as a video, and in one picture; returns the files' names."""
     from mjx_drax.physics.dynamics import mujoco_model
-    from mjx_drax.view.rendering import render
     from mjx_drax.view.timelapse import render_timelapse
+    from mjx_drax.view.video import render
 
     model = mujoco_model(solution.problem.dynamics)
     if model is None and draw is None:

@@ -93,11 +93,12 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.search.restarts import as_restarts
     from mjx_drax.solution import save as results
     from mjx_drax.solution.solution import solve
-    from mjx_drax.view.rendering import check as require_drawing
+    from mjx_drax.view.video import check as require_drawing
 
     as_restarts(problem, chains, options.seed, solver)  # refuses settings that cannot work
     wanted = exports.chosen(options)
-    exports.require(problem, wanted)
+    for each in wanted:
+        each.check(problem)
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = {name: getattr(options, name) for name in LOOK if getattr(options, name) is not None}
@@ -125,7 +126,7 @@ def run(options: argparse.Namespace) -> int:
     if not options.no_video:
         written += pictures.write_video(solution, folder, draw, look)
     if film is not None:
-        from mjx_drax.view.film import render_diffusion
+        from mjx_drax.view.diffusion import render_diffusion
 
         render_diffusion(solution, film, draw=draw, **look)
     written += exports.write(solution, folder, wanted, tell)
@@ -135,7 +136,7 @@ def run(options: argparse.Namespace) -> int:
     if film is not None:
         tell(f"film written to {film}")
         written += [film.name] * (film.resolve().parent == folder.resolve())
-    names = (*pictures.NAMES, *(file for file, _ in exports.EXPORTS.values()))
+    names = (*pictures.NAMES, *(each.file for each in exports.exporters().values()))
     older = [name for name in names if name not in written and (folder / name).exists()]
     if older:
         tell(f"there from an earlier solve: {', '.join(older)}")

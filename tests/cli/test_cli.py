@@ -44,6 +44,17 @@ SLIDER = """
 </mujoco>
 """
 
+OWN_EXPORTER = """
+import numpy as np
+from mjx_drax import Exporter
+
+class Costs(Exporter):
+    file = "costs.txt"
+
+    def write(self, solution, path):
+        np.savetxt(path, solution.cost)
+"""
+
 
 @pytest.fixture
 def own(tmp_path):
@@ -189,6 +200,17 @@ def test_export_writes_what_is_asked_for(slider, tmp_path, capsys):
     assert "nowhere" in error_of(capsys, "export", str(tmp_path / "nowhere"), "--csv")
 
 
+def test_an_exporter_of_your_own_is_given_by_its_name(slider, tmp_path, capsys, monkeypatch):
+    (tmp_path / "mine.py").write_text(OWN_EXPORTER)
+    monkeypatch.chdir(tmp_path)
+    slider.save(tmp_path / "out")
+    assert main(["export", "out", "--csv", "--export", "mine:Costs", "--export", "mine:Costs"]) == 0
+    assert "written to out/: replay.csv, costs.txt\n" in capsys.readouterr().out
+    written = np.loadtxt(tmp_path / "out" / "costs.txt")
+    np.testing.assert_allclose(written, slider.cost)
+    assert "cannot be imported" in error_of(capsys, "export", "out", "--export", "mine:Cost")
+
+
 def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, monkeypatch, without):
     monkeypatch.setattr(
         "mjx_drax.solution.solution.solve", lambda *_, **__: pytest.fail("it was solved")
@@ -239,7 +261,7 @@ def test_a_dataset_without_certified_chains_is_left_out(slider, tmp_path, capsys
     if importlib.util.find_spec("h5py") is None:
         pytest.skip("no h5py")
     assert main(["export", str(tmp_path), "--csv", "--dataset"]) == 0
-    assert "no chain is certified: dataset.h5 is left out" in capsys.readouterr().out
+    assert "dataset.h5 is left out: no chain is certified" in capsys.readouterr().out
     assert not (tmp_path / "dataset.h5").exists()
 
 
