@@ -3,11 +3,14 @@
 Sizes stand in the cell tagged `parameters`; after it the small ones below take their place.
 """
 
+import ast
 import json
 from pathlib import Path
 
 import matplotlib as mpl
 import pytest
+
+import mjx_drax
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
@@ -18,8 +21,6 @@ SMALL = {
     "diagnostics": {"CHAINS": 4, "TRAPPED": 8},
     "thousands": {"CHAINS": 32, "TRAPPED": 8, "PROBLEMS": 2, "STATES": 16},
 }
-
-FAST = ("quickstart",)
 
 
 def code(path):
@@ -37,14 +38,20 @@ def test_the_first_cell_installs_what_is_missing(path):
     assert "git+REPOSITORY" in "".join(code(path)[0]["source"])
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_every_import_finds_its_names(path):
+    """Quickly, what running every cell finds out slowly."""
+    source = "\n".join("".join(cell["source"]) for cell in code(path)[1:])
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom | ast.Import):
+            exec(compile(ast.Module([node], []), str(path), "exec"), {})
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "mjx_drax":
+            assert hasattr(mjx_drax, node.attr), node.attr
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, id=path.stem, marks=[] if path.stem in FAST else pytest.mark.slow)
-        for path in NOTEBOOKS
-    ],
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_cell_runs(path, tmp_path, monkeypatch):
     mpl.use("Agg")
     monkeypatch.chdir(tmp_path)
