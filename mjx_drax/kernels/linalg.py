@@ -9,11 +9,14 @@ can wait for each other forever in jaxlib's thread pool (0.10, on two cores, nea
 from __future__ import annotations
 
 from functools import partial
+from operator import truediv
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
+
+from mjx_drax.kernels import small_matrices
 
 UNROLLED_UP_TO = 8
 
@@ -22,7 +25,7 @@ SUMMED_UP_TO = 256
 library takes a block of threads for each product of a batch, however small."""
 
 
-exact = jax.default_matmul_precision("float32")
+full_precision = jax.default_matmul_precision("float32")
 """Context, or decorator, in which products are of float32 numbers. GPUs round factors to 10 bits by
 default, and defects then stay above 1e-3."""
 
@@ -36,17 +39,19 @@ def cholesky(matrix: Array) -> Array:
         return jax.lax.platform_dependent(
             matrix, cpu=_cholesky_by_columns, default=jnp.linalg.cholesky
         )
-    rows: list[list[Array]] = []
     zero = jnp.zeros_like(matrix[0, 0])
-    for i in range(n):
-        row: list[Array] = []
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total = total - row[k] * (row[k] if i == j else rows[j][k])
-            row.append(jnp.sqrt(total) if i == j else total / rows[j][j])
-        rows.append(row)
-    return jnp.stack([jnp.stack(row + [zero] * (n - len(row))) for row in rows])
+    rows = small_matrices.cholesky(_lower_rows(matrix), jnp.sqrt, truediv)
+    return jnp.stack([jnp.stack([*row, *[zero] * (n - len(row))]) for row in rows])
+
+
+def _lower_rows(matrix: Array) -> list[list[Array]]:
+    """The entries of the lower triangle."""
+    return [[matrix[i, j] for j in range(i + 1)] for i in range(matrix.shape[-1])]
+
+
+def _times_inverse(x: Array, divisor: Array) -> Array:
+    """x / divisor: one division serves all columns of x."""
+    return x * (1.0 / divisor)
 
 
 def _cholesky_by_columns(matrix: Array) -> Array:
@@ -88,13 +93,8 @@ def solve_lower(factor: Array, b: Array) -> Array:
     if n > UNROLLED_UP_TO:
         library = partial(solve_triangular, lower=True)
         return jax.lax.platform_dependent(factor, b, cpu=_lower_by_rows, default=library)
-    out: list[Array] = []
-    for i in range(n):
-        total = b[i]
-        for j in range(i):
-            total = total - factor[i, j] * out[j]
-        out.append(total * (1.0 / factor[i, i]))
-    return jnp.stack(out)
+    rows, entries = _lower_rows(factor), [b[i] for i in range(n)]
+    return jnp.stack(small_matrices.solve_lower(rows, entries, _times_inverse))
 
 
 def solve_upper(factor: Array, b: Array) -> Array:
@@ -105,13 +105,8 @@ def solve_upper(factor: Array, b: Array) -> Array:
     if n > UNROLLED_UP_TO:
         library = partial(solve_triangular, lower=True, trans=1)
         return jax.lax.platform_dependent(factor, b, cpu=_upper_by_rows, default=library)
-    out: list[Array] = [b[0]] * n
-    for i in reversed(range(n)):
-        total = b[i]
-        for j in range(i + 1, n):
-            total = total - factor[j, i] * out[j]
-        out[i] = total * (1.0 / factor[i, i])
-    return jnp.stack(out)
+    rows, entries = _lower_rows(factor), [b[i] for i in range(n)]
+    return jnp.stack(small_matrices.solve_upper(rows, entries, _times_inverse))
 
 
 def solve(factor: Array, b: Array) -> Array:

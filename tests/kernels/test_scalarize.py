@@ -1,20 +1,15 @@
 """Scalar arithmetic against the functions it stands for; what it prunes, and when it gives up."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
 
-from mjx_drax import from_mjcf
-from mjx_drax.kernels import rows as scalar_kernel
-from mjx_drax.kernels import scalarize as scalar
-from mjx_drax.kernels.scalarize import pruned, scalarized
-from mjx_drax.models import path
-from mjx_drax.physics import mjcf
-from mjx_drax.problem.differentiators import Autodiff, InScalars
+from mjx_drax.kernels import scalarize
+from mjx_drax.kernels.pruning import pruned
+from mjx_drax.kernels.scalar_arithmetic import IN_KERNELS
+from mjx_drax.kernels.scalarize import scalarized
 
 RNG = np.random.default_rng(0)
 A = RNG.uniform(0.5, 2.0, (3, 4))
@@ -120,10 +115,16 @@ def close(seen, wanted, rtol):
 def strictly(monkeypatch):
     """Falling back is a failure."""
 
-    def refuse(closed):
+    def refuse(program, inputs):
         raise AssertionError("fell back")
 
-    monkeypatch.setattr(scalar, "_in_arrays", refuse)
+    monkeypatch.setattr(scalarize, "unchanged", refuse)
+
+
+@pytest.fixture
+def on_gpu(monkeypatch):
+    """What is built on a GPU; it runs here without the kernel itself."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
 
 @pytest.mark.parametrize("x64", [False, True])
@@ -153,10 +154,11 @@ def test_inside_of_every_transformation(strictly):
 
 def operations(function, *arguments):
     """Arithmetic that the scalarized function's outputs need, without what moves numbers about."""
-    jaxpr = jax.make_jaxpr(scalarized(function))(*arguments).jaxpr
     moves = {"slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim"}
-    live = (e.primitive.name for e, _ in scalar._live(jaxpr, [True] * len(jaxpr.outvars)))
-    return sorted(name for name in live if name not in moves)
+    names = [
+        e.primitive.name for e in jax.make_jaxpr(pruned(scalarized(function)))(*arguments).eqns
+    ]
+    return sorted(name for name in names if name not in moves)
 
 
 @pytest.mark.parametrize(
@@ -231,9 +233,8 @@ def pulled(x, y, z):
 
 @pytest.mark.parametrize("outer", [(0, 0, None), (None, 0, None), (None, None, 0)])
 @pytest.mark.parametrize("inner", [(0, None, None), (0, 0, 0)])
-def test_rows_of_a_batch_are_those_of_single_calls(inner, outer, strictly, monkeypatch):
-    """As on a GPU, but for the kernel itself: any argument may be batched at any level."""
-    monkeypatch.setattr(scalar, "_on_gpu", lambda: True)
+def test_rows_of_a_batch_are_those_of_single_calls(inner, outer, strictly, on_gpu):
+    """Any argument may be batched at any level."""
     sizes = [[n for n, axes in ((4, outer), (3, inner)) if axes[i] == 0] for i in range(3)]
     arguments = [RNG.uniform(0.5, 2.0, (*size, 2)).astype(np.float32) for size in sizes]
 
@@ -245,44 +246,18 @@ def test_rows_of_a_batch_are_those_of_single_calls(inner, outer, strictly, monke
     assert "custom_vmap" in str(jax.make_jaxpr(scalarized(pulled, outermost=True))(*single))
 
 
-def program_of(function, *sizes):
-    """The function of the entries of arrays, as a kernel takes it."""
+def test_kernels_write_each_number_once_and_none_that_is_known(strictly, on_gpu, monkeypatch):
+    written, as_kernel = set(), scalarize.vmapped_as_kernel
 
-    def of_entries(*entries):
-        ends = np.cumsum(sizes)
-        arrays = [jnp.stack(entries[e - n : e]) for n, e in zip(sizes, ends, strict=True)]
-        return [out[i] for out in [jnp.ravel(function(*arrays))] for i in range(out.size)]
-
-    return jax.make_jaxpr(scalarized(of_entries))(*[jnp.ones(())] * sum(sizes))
-
-
-def test_the_kernel_computes_every_row():
-    rows = scalar_kernel.THREADS + 5  # one block of threads, and another that is not full
-    x, y, z = (RNG.uniform(0.5, 2.0, n).astype(np.float32) for n in ((rows, 2), 2, 2))
-
-    def function(z, x, y):
-        return pulled(x, y, z)["out"]
-
-    batched = (False, True, False)
-    program = program_of(function, 2, 2, 2)
-    seen = scalar_kernel.over_rows(program, batched, z, x, y, interpret=True)
-    wanted = jax.vmap(function, (None, 0, None))(z, x, y)
-    np.testing.assert_allclose(seen, wanted.reshape(rows, -1), rtol=1e-6)
-
-
-def test_kernels_write_each_number_once_and_none_that_is_known(strictly, monkeypatch):
-    written, by_rows = set(), scalar_kernel.by_rows
-
-    def counted(program, *batched):
+    def counted(program):
         written.add(len(program.out_avals))
-        return by_rows(program, *batched)
+        return as_kernel(program)
 
     def mostly_known(x):
         once = jnp.diag(jnp.sin(x))
         return jnp.stack([once, 2.0 * jnp.eye(3), once])
 
-    monkeypatch.setattr(scalar, "_on_gpu", lambda: True)
-    monkeypatch.setattr(scalar_kernel, "by_rows", counted)
+    monkeypatch.setattr(scalarize, "vmapped_as_kernel", counted)
     x = jnp.asarray(A, jnp.float32).reshape(-1)[:6].reshape(2, 3)
     for function in (mostly_known, lambda x: jnp.outer(jnp.ones(2), jnp.ones(3))):
         seen = jax.jit(jax.vmap(scalarized(function, outermost=True)))(x)
@@ -290,7 +265,7 @@ def test_kernels_write_each_number_once_and_none_that_is_known(strictly, monkeyp
     assert written == {3}
 
 
-@pytest.mark.parametrize("name", sorted(scalar._IN_KERNELS))
+@pytest.mark.parametrize("name", sorted(IN_KERNELS))
 def test_kernels_hold_only_what_pallas_lowers(name):
     from jax._src.pallas.triton.lowering import triton_lowering_rules
 
@@ -298,168 +273,6 @@ def test_kernels_hold_only_what_pallas_lowers(name):
 
 
 @pytest.mark.parametrize("function", [jnp.round, jax.scipy.special.erf, lambda x: x.astype(int)])
-def test_what_kernels_lack_stays_in_loops(function, strictly, monkeypatch):
-    monkeypatch.setattr(scalar, "_on_gpu", lambda: True)
+def test_what_kernels_lack_stays_in_loops(function, strictly, on_gpu):
     x = jnp.asarray(A, jnp.float32)
     close(jax.jit(jax.vmap(scalarized(function, outermost=True)))(x), function(x), 1e-6)
-
-
-EVERYTHING = """
-<mujoco model="everything">
-  <option timestep="0.01" gravity="1 -2 -9"><flag contact="disable"/></option>
-  <worldbody>
-    <body pos="0 0.1 1" euler="10 20 30">
-      <joint name="rail" type="slide" axis="1 0 0.5" damping="0.3" stiffness="2" springref="0.2"/>
-      <geom type="box" size="0.1 0.2 0.3" pos="0.05 0.02 0.01"/>
-      <body pos="0.3 0 0.1">
-        <joint name="arm" axis="0 1 0.2" pos="0.01 0 0.02" armature="0.1" damping="0.2"/>
-        <inertial pos="0.2 0.05 0.01" mass="0.7" fullinertia="0.02 0.03 0.04 0.001 0.002 0.003"/>
-        <body pos="0 0 0.4" quat="0.9 0.1 0.3 0.2">
-          <joint name="wrist" axis="1 1 1" stiffness="1"/>
-          <geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.3"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor joint="rail" gear="3"/>
-    <position joint="arm" kp="5" kv="1"/>
-    <general joint="wrist" dyntype="filter" dynprm="0.1" gainprm="2"/>
-  </actuator>
-</mujoco>"""
-
-
-def chain(links):
-    body = "".join(
-        f'<body pos="0 0 {-0.5 * (i > 0)}"><joint name="j{i}" axis="0 1 0" damping="0.1"/>'
-        '<geom type="capsule" size="0.04" fromto="0 0 0 0 0 -0.5"/>'
-        for i in range(links)
-    )
-    return (
-        '<mujoco><option timestep="0.01"><flag contact="disable"/></option>'
-        f"<worldbody>{body}{'</body>' * links}</worldbody>"
-        '<actuator><motor joint="j0"/><motor joint="j1" gear="2"/></actuator></mujoco>'
-    )
-
-
-def task(model):
-    model = path(model) if model in ("pendulum", "cartpole", "acrobot") else model
-    return from_mjcf(model, horizon=0.02, dt=0.01, running_residual=lambda data, u: u)
-
-
-MODELS = {
-    **{name: name for name in ("pendulum", "cartpole", "acrobot")},
-    "chain": chain(5),
-    "everything": EVERYTHING,
-}
-
-
-SLOW = {"everything", "chain", "acrobot", "cartpole"}  # to compile
-
-
-@pytest.mark.parametrize(
-    "model", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in MODELS]
-)
-def test_steps_and_jacobians_are_those_of_mjx(model, monkeypatch):
-    with jax.enable_x64(True):
-        dynamics = task(MODELS[model]).dynamics
-        n, nx = dynamics.nx + dynamics.nu, dynamics.nx
-        z = jnp.asarray(RNG.uniform(-1.0, 1.0, n))
-
-        def derivatives(by, dynamics, z):
-            def f(dz):
-                return dynamics.step(*jnp.split(z + dz, [nx]))
-
-            return by.jacobian(f, n, jax.random.key(0))
-
-        def all_of_it(by, z, dynamics):
-            return jax.jit(lambda dynamics, z: derivatives(by, dynamics, z))(dynamics, z)
-
-        seen = all_of_it(InScalars(Autodiff()), z, dynamics)
-        monkeypatch.setattr(mjcf, "scalarized", lambda function, limit: function)
-        jax.clear_caches()
-        close(seen, all_of_it(Autodiff(), z, dynamics), 1e-12)
-
-
-def test_a_cart_pole_is_a_few_hundred_operations(strictly):
-    dynamics = task("cartpole").dynamics
-    x, u = jnp.zeros(4), jnp.zeros(1)
-
-    def f(dynamics, x, u):
-        return InScalars(Autodiff()).jacobian(
-            lambda dz: dynamics.step(x + dz[:4], u + dz[4:]), 5, jax.random.key(0)
-        )
-
-    jaxpr = jax.make_jaxpr(f)(dynamics, x, u)
-    live = scalar._live(jaxpr.jaxpr, [True, True])
-    moves = ("slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim")
-    assert sum(e.primitive.name not in moves for e, _ in live) < 600
-
-
-def after(dynamics):
-    return np.asarray(dynamics.step(jnp.array([0.3, 0.2]), jnp.array([0.1])))
-
-
-def test_a_number_that_was_zero_is_seen_when_it_changes():
-    dynamics = task("pendulum").dynamics
-    model = dynamics.model
-    assert np.asarray(model.opt.gravity)[0] == 0
-    assert np.asarray(model.dof_armature)[0] == 0
-    for change in (
-        {"dof_armature": model.dof_armature + 1.0},
-        {"opt": model.opt.replace(gravity=jnp.array([5.0, 0.0, -9.81]))},
-        {"jnt_axis": jnp.array([[0.0, -0.8, 0.6]])},
-    ):
-        other = replace(dynamics, model=model.replace(**change))
-        assert other.structure != dynamics.structure
-        assert np.abs(after(other) - after(dynamics)).max() > 1e-4, change
-        # and inside of a compiled function, where the numbers themselves are not known
-        seen = jax.jit(lambda change: after_of(dynamics, change))(change)
-        np.testing.assert_allclose(seen, after(other), rtol=1e-5)
-
-
-def after_of(dynamics, change):
-    other = replace(dynamics, model=dynamics.model.replace(**change))
-    return other.step(jnp.array([0.3, 0.2]), jnp.array([0.1]))
-
-
-def test_other_numbers_have_the_same_structure():
-    dynamics = task("pendulum").dynamics
-    model = dynamics.model
-    heavy = replace(dynamics, model=model.replace(body_mass=2.0 * model.body_mass))
-    assert heavy.structure == dynamics.structure
-    before, _ = after(dynamics), mjcf._step._cache_size()
-    size = mjcf._step._cache_size()
-    assert np.abs(after(heavy) - before).max() > 1e-4
-    assert mjcf._step._cache_size() == size
-
-
-def test_dynamics_survive_as_a_pytree():
-    dynamics = task("pendulum").dynamics
-    leaves, tree = jax.tree.flatten(dynamics)
-    again = jax.tree.unflatten(tree, leaves)
-    assert again.structure == dynamics.structure
-    assert (again.dt, again.substeps) == (dynamics.dt, dynamics.substeps)
-    many = jax.tree.map(lambda a: jnp.stack([jnp.asarray(a)] * 2), dynamics)
-    x, u = jnp.array([0.3, 0.2]), jnp.array([0.1])
-    seen = jax.vmap(lambda dynamics: dynamics.step(x, u))(many)
-    np.testing.assert_allclose(seen, [after(dynamics)] * 2, rtol=1e-6)
-
-
-def test_pruned_keeps_what_the_result_needs_inside_of_functions_too():
-    """And loses the rest before it is differentiated; what is closed over may be traced."""
-
-    @jax.jit
-    def observe(x):
-        return {"sine": jnp.sin(x), "loop": jax.lax.fori_loop(0, 3, lambda i, y: 2 * y, x)}
-
-    def derivative(scale, x):
-        return jax.jvp(pruned(lambda x: scale * observe(x)["sine"]), (x,), (jnp.ones(2),))
-
-    x = jnp.array([0.3, 1.0])
-    text = str(jax.make_jaxpr(derivative)(2.0, x))
-    assert "sin" in text
-    assert "scan" not in text
-    value, slope = jax.jit(derivative)(2.0, x)
-    np.testing.assert_allclose(value, 2 * np.sin(x), rtol=1e-6)
-    np.testing.assert_allclose(slope, 2 * np.cos(x), rtol=1e-6)

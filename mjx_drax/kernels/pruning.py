@@ -1,0 +1,45 @@
+"""Functions without the operations that their results do not need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+import jax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.interpreters.partial_eval import dce_jaxpr
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def pruned(function: Function) -> Function:
+    """The same function of pytrees of arrays, without the operations that its result does not need.
+
+    XLA drops these, but only after JAX has differentiated and lowered them; and a step of physics
+    computes much that a cost does not read.
+    """
+
+    @wraps(function)
+    def lean(*arguments: Any) -> Any:
+        program, inputs, tree = needed_program(function, arguments)
+        try:
+            return jax.tree.unflatten(tree, jaxpr_as_fun(program)(*inputs))
+        except TypeError:  # constants that jax kept from another precision
+            return function(*arguments)
+
+    return cast(Function, lean)
+
+
+def needed_program(
+    function: Callable[..., Any], arguments: tuple[Any, ...]
+) -> tuple[ClosedJaxpr, list[Any], Any]:
+    """What the function computes and its result needs, its inputs, and the result's structure."""
+    program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    return without_unused(program), jax.tree.leaves(arguments), jax.tree.structure(shapes)
+
+
+def without_unused(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The program without operations that no output needs."""
+    every = [True] * len(program.jaxpr.outvars)
+    return program.replace(jaxpr=dce_jaxpr(program.jaxpr, every, instantiate=True)[0])

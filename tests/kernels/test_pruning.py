@@ -1,0 +1,39 @@
+"""A pruned function gives what the function gives, and computes nothing else."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax.kernels.pruning import pruned
+
+
+def test_pruned_keeps_what_the_result_needs_inside_of_functions_too():
+    """And loses the rest before it is differentiated; what is closed over may be traced."""
+
+    @jax.jit
+    def observe(x):
+        return {"sine": jnp.sin(x), "loop": jax.lax.fori_loop(0, 3, lambda i, y: 2 * y, x)}
+
+    def derivative(scale, x):
+        return jax.jvp(pruned(lambda x: scale * observe(x)["sine"]), (x,), (jnp.ones(2),))
+
+    x = jnp.array([0.3, 1.0])
+    text = str(jax.make_jaxpr(derivative)(2.0, x))
+    assert "sin" in text
+    assert "scan" not in text
+    value, slope = jax.jit(derivative)(2.0, x)
+    np.testing.assert_allclose(value, 2 * np.sin(x), rtol=1e-6)
+    np.testing.assert_allclose(slope, 2 * np.cos(x), rtol=1e-6)
+
+
+def test_pruned_functions_of_pytrees_return_the_same_pytrees():
+    def function(x, scale):
+        unused = jnp.sort(x)
+        return {"x": [scale["a"] * x, None], "sum": unused.sum() * 0 + x.sum()}
+
+    x, scale = jnp.arange(3.0), {"a": 2.0, "b": 3.0}
+    seen, wanted = jax.jit(pruned(function))(x, scale), function(x, scale)
+    assert jax.tree.structure(seen) == jax.tree.structure(wanted)
+    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert pruned(function).__name__ == "function"

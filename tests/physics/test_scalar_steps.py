@@ -1,0 +1,164 @@
+"""Steps of MJX in scalar arithmetic: the same numbers, few operations, constants may change."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax import from_mjcf
+from mjx_drax.kernels.pruning import pruned
+from mjx_drax.models import path
+from mjx_drax.physics import dynamics as mjx_dynamics
+from mjx_drax.problem.differentiators import Autodiff, InScalars
+
+RNG = np.random.default_rng(0)
+
+
+def close(seen, wanted, rtol):
+    for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(wanted), strict=True):
+        scale = max(1.0, np.abs(b).max(initial=0.0))
+        np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol * scale)
+
+
+EVERYTHING = """
+<mujoco model="everything">
+  <option timestep="0.01" gravity="1 -2 -9"><flag contact="disable"/></option>
+  <worldbody>
+    <body pos="0 0.1 1" euler="10 20 30">
+      <joint name="rail" type="slide" axis="1 0 0.5" damping="0.3" stiffness="2" springref="0.2"/>
+      <geom type="box" size="0.1 0.2 0.3" pos="0.05 0.02 0.01"/>
+      <body pos="0.3 0 0.1">
+        <joint name="arm" axis="0 1 0.2" pos="0.01 0 0.02" armature="0.1" damping="0.2"/>
+        <inertial pos="0.2 0.05 0.01" mass="0.7" fullinertia="0.02 0.03 0.04 0.001 0.002 0.003"/>
+        <body pos="0 0 0.4" quat="0.9 0.1 0.3 0.2">
+          <joint name="wrist" axis="1 1 1" stiffness="1"/>
+          <geom type="capsule" size="0.05" fromto="0 0 0 0.1 0.2 0.3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="rail" gear="3"/>
+    <position joint="arm" kp="5" kv="1"/>
+    <general joint="wrist" dyntype="filter" dynprm="0.1" gainprm="2"/>
+  </actuator>
+</mujoco>"""
+
+
+def chain(links):
+    body = "".join(
+        f'<body pos="0 0 {-0.5 * (i > 0)}"><joint name="j{i}" axis="0 1 0" damping="0.1"/>'
+        '<geom type="capsule" size="0.04" fromto="0 0 0 0 0 -0.5"/>'
+        for i in range(links)
+    )
+    return (
+        '<mujoco><option timestep="0.01"><flag contact="disable"/></option>'
+        f"<worldbody>{body}{'</body>' * links}</worldbody>"
+        '<actuator><motor joint="j0"/><motor joint="j1" gear="2"/></actuator></mujoco>'
+    )
+
+
+def task(model):
+    model = path(model) if model in ("pendulum", "cartpole", "acrobot") else model
+    return from_mjcf(model, horizon=0.02, dt=0.01, running_residual=lambda data, u: u)
+
+
+MODELS = {
+    **{name: name for name in ("pendulum", "cartpole", "acrobot")},
+    "chain": chain(5),
+    "everything": EVERYTHING,
+}
+
+
+SLOW = {"everything", "chain", "acrobot", "cartpole"}  # to compile
+
+
+@pytest.mark.parametrize(
+    "model", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in MODELS]
+)
+def test_steps_and_jacobians_are_those_of_mjx(model, monkeypatch):
+    with jax.enable_x64(True):
+        dynamics = task(MODELS[model]).dynamics
+        n, nx = dynamics.nx + dynamics.nu, dynamics.nx
+        z = jnp.asarray(RNG.uniform(-1.0, 1.0, n))
+
+        def derivatives(by, dynamics, z):
+            def f(dz):
+                return dynamics.step(*jnp.split(z + dz, [nx]))
+
+            return by.jacobian(f, n, jax.random.key(0))
+
+        def all_of_it(by, z, dynamics):
+            return jax.jit(lambda dynamics, z: derivatives(by, dynamics, z))(dynamics, z)
+
+        seen = all_of_it(InScalars(Autodiff()), z, dynamics)
+        monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, limit: function)
+        jax.clear_caches()
+        close(seen, all_of_it(Autodiff(), z, dynamics), 1e-12)
+
+
+def test_a_cart_pole_is_a_few_hundred_operations():
+    dynamics = task("cartpole").dynamics
+    x, u = jnp.zeros(4), jnp.zeros(1)
+
+    def f(dynamics, x, u):
+        return InScalars(Autodiff()).jacobian(
+            lambda dz: dynamics.step(x + dz[:4], u + dz[4:]), 5, jax.random.key(0)
+        )
+
+    equations = jax.make_jaxpr(pruned(f))(dynamics, x, u).eqns
+    moves = ("slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim")
+    assert sum(e.primitive.name not in moves for e in equations) < 600
+    assert all(e.outvars[0].aval.size == 1 or e.primitive.name in moves for e in equations)
+
+
+def after(dynamics):
+    return np.asarray(dynamics.step(jnp.array([0.3, 0.2]), jnp.array([0.1])))
+
+
+def test_a_number_that_was_zero_is_seen_when_it_changes():
+    dynamics = task("pendulum").dynamics
+    model = dynamics.model
+    assert np.asarray(model.opt.gravity)[0] == 0
+    assert np.asarray(model.dof_armature)[0] == 0
+    for change in (
+        {"dof_armature": model.dof_armature + 1.0},
+        {"opt": model.opt.replace(gravity=jnp.array([5.0, 0.0, -9.81]))},
+        {"jnt_axis": jnp.array([[0.0, -0.8, 0.6]])},
+    ):
+        other = replace(dynamics, model=model.replace(**change))
+        assert other.structure != dynamics.structure
+        assert np.abs(after(other) - after(dynamics)).max() > 1e-4, change
+        # and inside of a compiled function, where the numbers themselves are not known
+        seen = jax.jit(lambda change: after_of(dynamics, change))(change)
+        np.testing.assert_allclose(seen, after(other), rtol=1e-5)
+
+
+def after_of(dynamics, change):
+    other = replace(dynamics, model=dynamics.model.replace(**change))
+    return other.step(jnp.array([0.3, 0.2]), jnp.array([0.1]))
+
+
+def test_other_numbers_have_the_same_structure():
+    dynamics = task("pendulum").dynamics
+    model = dynamics.model
+    heavy = replace(dynamics, model=model.replace(body_mass=2.0 * model.body_mass))
+    assert heavy.structure == dynamics.structure
+    before, _ = after(dynamics), mjx_dynamics._step._cache_size()
+    size = mjx_dynamics._step._cache_size()
+    assert np.abs(after(heavy) - before).max() > 1e-4
+    assert mjx_dynamics._step._cache_size() == size
+
+
+def test_dynamics_survive_as_a_pytree():
+    dynamics = task("pendulum").dynamics
+    leaves, tree = jax.tree.flatten(dynamics)
+    again = jax.tree.unflatten(tree, leaves)
+    assert again.structure == dynamics.structure
+    assert (again.dt, again.substeps) == (dynamics.dt, dynamics.substeps)
+    many = jax.tree.map(lambda a: jnp.stack([jnp.asarray(a)] * 2), dynamics)
+    x, u = jnp.array([0.3, 0.2]), jnp.array([0.1])
+    seen = jax.vmap(lambda dynamics: dynamics.step(x, u))(many)
+    np.testing.assert_allclose(seen, [after(dynamics)] * 2, rtol=1e-6)
