@@ -24,41 +24,21 @@ and S are at hand. Newton step and noise are hence two solutions of one affine r
 
 that is solved in parallel over time. Shapes: all arrays carry the stage axis K first.
 
-On a GPU a batch of chains with small blocks goes through one kernel instead (`riccati_kernel`): the
-recursion as a loop of array operations is bound by its launches there.
+With thousands of chains on a GPU one kernel does the same, stage by stage (`kernels.riccati_gpu`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.custom_batching import custom_vmap
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels.linalg import cholesky, solve, solve_upper, symmetric
-from mjx_drax.method.linearize import Linearization
-
-MAX_NDX, MAX_NU = 6, 4
-"""Largest blocks that the kernel unrolls; compiling it takes longer than it saves beyond."""
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class QuadraticCost:
-    """Second-order model of the cost at x_0..x_K and u_0..u_{K-1}; all Hessians semidefinite.
-
-    gx (K+1, ndx), gu (K, nu), Hxx (K+1, ndx, ndx), Hux (K, nu, ndx), Huu (K, nu, nu).
-    """
-
-    gx: Array
-    gu: Array
-    Hxx: Array
-    Hux: Array
-    Huu: Array
+from mjx_drax.kernels.riccati_gpu import vmapped_as_kernel
+from mjx_drax.method.model import Linearization, QuadraticCost
 
 
 @register_dataclass
@@ -92,14 +72,14 @@ class White:
 class Step:
     """What a chain moves by.
 
-    Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise nx, nu alike; the multipliers' step
-    `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx).
+    Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise nx, nu alike, or None; the
+    multipliers' step `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx).
     """
 
     dx: Array
     du: Array
-    nx: Array
-    nu: Array
+    nx: Array | None
+    nu: Array | None
     rate: Array
     K: Array
 
@@ -134,92 +114,56 @@ def factorize(
 
 
 def solve_and_sample(
-    model: Linearization, factors: Factorization, multipliers: Array, penalty: Array, white: White
+    model: Linearization,
+    factors: Factorization,
+    multipliers: Array,
+    penalty: Array,
+    white: White | None = None,
 ) -> Step:
     """The Newton step d = -M^{-1} grad L_mu, one draw n ~ N(0, M^{-1}), and the multipliers' step.
 
-    The last is the costate P dx + p of the quadratic program less the present multipliers.
+    The draw is of the white numbers; without them there is none. The multipliers' step is the
+    costate P dx + p of the quadratic program less the present multipliers.
     """
 
     def affine(
-        model: Linearization, factors: Factorization, multiplier: Array, xi_u: Array, xi_s: Array
+        model: Linearization, factors: Factorization, multiplier: Array, white: White | None
     ) -> tuple[Array, Array]:
-        n_u = solve_upper(factors.Lu, xi_u)
-        n_s = solve_upper(factors.Ls, xi_s)
+        """F, and the columns f of the step and of the noise."""
         step = model.h + model.B @ factors.kff
-        noise = model.B @ n_u
         closed = model.A + model.B @ factors.K
-        right = jnp.column_stack(
-            [penalty * closed, penalty * step - factors.p + multiplier, penalty * noise]
-        )
-        out = solve(factors.Ls, right)
-        F, f, f_noise = out[:, :-2], out[:, -2], out[:, -1] - n_s
-        return F, jnp.column_stack([f, f_noise])
-
-    F, f = jax.vmap(affine)(model, factors, multipliers, white.u, white.e)
+        right = [penalty * closed, penalty * step - factors.p + multiplier]
+        if white is None:
+            out = solve(factors.Ls, jnp.column_stack(right))
+            return out[:, :-1], out[:, -1:]
+        noise = model.B @ solve_upper(factors.Lu, white.u)
+        out = solve(factors.Ls, jnp.column_stack([*right, penalty * noise]))
+        f_noise = out[:, -1] - solve_upper(factors.Ls, white.e)
+        return out[:, :-2], jnp.column_stack([out[:, -2], f_noise])
 
     def compose(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
         return second[0] @ first[0], second[0] @ first[1] + second[1]
 
-    after = jax.lax.associative_scan(compose, (F, f))[1]  # dx_1..dx_K since dx_0 = 0
+    F_and_f = jax.vmap(affine)(model, factors, multipliers, white)
+    after = jax.lax.associative_scan(compose, F_and_f)[1]  # dx_1..dx_K since dx_0 = 0
     before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])
     controls = factors.K @ before
-    du = controls[..., 0] + factors.kff
-    nu = controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
-    dx, nx = after[..., 0], after[..., 1]
+    dx, du = after[..., 0], controls[..., 0] + factors.kff
+    nx, nu = None, None
+    if white is not None:
+        nx, nu = after[..., 1], controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
     costate = jnp.einsum("kij,kj->ki", factors.P, dx) + factors.p
     return Step(dx, du, nx, nu, costate - multipliers, factors.K)
 
 
-@custom_vmap
+@vmapped_as_kernel(result=Step)
 def newton(
-    model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array, white: White
+    model: Linearization,
+    cost: QuadraticCost,
+    multipliers: Array,
+    penalty: Array,
+    white: White | None = None,
 ) -> Step:
-    """Newton step and noise of one chain; a batch of chains by whatever suits the device."""
+    """Newton step of one chain for multipliers (K, ndx) and penalty mu; noise of `white`."""
     factors = factorize(model, cost, multipliers, penalty)
     return solve_and_sample(model, factors, multipliers, penalty, white)
-
-
-@custom_vmap
-def _batch(*arguments: Any) -> Step:
-    """`newton` of many chains; every array leads with the chain axis."""
-    _, cost, multipliers, _, _ = arguments
-    plain = jax.vmap(newton.fun)
-    fits = multipliers.dtype == jnp.float32 and 0 < cost.gx.shape[-1] <= MAX_NDX
-    if not (fits and 0 < cost.gu.shape[-1] <= MAX_NU and jax.default_backend() == "gpu"):
-        return plain(*arguments)
-    from mjx_drax.kernels.riccati_gpu import (
-        newton_batch,  # only here: importing Pallas takes a second
-    )
-
-    return jax.lax.platform_dependent(*arguments, cuda=newton_batch, default=plain)
-
-
-@newton.def_vmap
-def _over_chains(size: int, batched: Any, *arguments: Any) -> tuple[Step, Step]:
-    """vmap over chains is one call of `_batch`."""
-    return _all_batched(_batch(*_spread(size, batched, arguments)))
-
-
-@_batch.def_vmap
-def _over_problems(size: int, batched: Any, *arguments: Any) -> tuple[Step, Step]:
-    """vmap over problems just makes the batch longer."""
-    spread = _spread(size, batched, arguments)
-    chains = spread[2].shape[1]
-    merged = jax.tree.map(lambda a: a.reshape(size * chains, *a.shape[2:]), spread)
-    step = _batch(*merged)
-    return _all_batched(jax.tree.map(lambda a: a.reshape(size, chains, *a.shape[1:]), step))
-
-
-def _spread(size: int, batched: Any, arguments: Any) -> Any:
-    """The arguments, those that lack the mapped axis repeated along it."""
-    return jax.tree.map(
-        lambda a, b: a if b else jnp.broadcast_to(a, (size, *jnp.shape(a))),
-        arguments,
-        tuple(batched),
-    )
-
-
-def _all_batched(step: Step) -> tuple[Step, Step]:
-    """The result, and that all of it has the mapped axis."""
-    return step, jax.tree.map(lambda _: True, step)

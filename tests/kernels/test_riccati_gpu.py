@@ -1,0 +1,87 @@
+"""The kernel of the Riccati recursion, interpreted, against the plain recursion of the method."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax.kernels import riccati_gpu
+from mjx_drax.kernels.riccati_gpu import MAX_NDX, THREADS, newton_steps
+from mjx_drax.method.model import Linearization, QuadraticCost
+from mjx_drax.method.riccati import White, newton
+
+K, NDX, NU = 3, 3, 2
+JAX = tuple(map(int, jax.__version__.split(".")[:2]))
+
+
+def batch(chains, dtype, noisy=True, ndx=NDX):
+    """A different problem for every chain, penalties included."""
+    rng = np.random.default_rng(0)
+    n = ndx + NU
+    A, B, h = (rng.normal(size=(chains, K, ndx, *m)) for m in [(ndx,), (NU,), ()])
+    half = rng.normal(size=(chains, K + 1, n, n))
+    H, g = half @ half.swapaxes(-1, -2) + 0.1 * np.eye(n), rng.normal(size=(chains, K + 1, n))
+    cost = QuadraticCost(
+        g[..., :ndx],
+        g[:, :-1, ndx:],
+        H[..., :ndx, :ndx],
+        H[:, :-1, ndx:, :ndx],
+        H[:, :-1, ndx:, ndx:],
+    )
+    white = White(rng.normal(size=(chains, K, NU)), rng.normal(size=(chains, K, ndx)))
+    multipliers, penalties = rng.normal(size=(chains, K, ndx)), np.geomspace(10.0, 1e4, chains)
+    arguments = (Linearization(A, B, h), cost, multipliers, penalties, white if noisy else None)
+    return jax.tree.map(lambda a: jnp.asarray(a, dtype), arguments)
+
+
+def agree(seen, wanted, tolerance):
+    for name in ("dx", "du", "nx", "nu", "rate", "K"):
+        a, b = seen[name], getattr(wanted, name)
+        assert (a is None) == (b is None), name
+        if a is not None:
+            scale = np.abs(b).max()
+            np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * scale, err_msg=name)
+
+
+@pytest.mark.parametrize("noisy", [True, False])
+def test_it_agrees_with_the_plain_recursion(noisy):
+    with jax.enable_x64(True):
+        arguments = batch(THREADS + 5, np.float64, noisy)  # two warps, one of them not full
+        plain = jax.jit(jax.vmap(newton))(*arguments)
+        agree(newton_steps(*jax.tree.leaves(arguments), interpret=True), plain, 1e-9)
+
+
+@pytest.mark.parametrize(("noisy", "ndx"), [(True, NDX), (False, NDX), (False, MAX_NDX + 1)])
+def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeypatch):
+    """As on a GPU, but interpreted: chains within problems are one launch."""
+    arguments = batch(6, np.float32, noisy, ndx)
+    plain = jax.jit(jax.vmap(newton))(*arguments)
+    calls = []
+
+    def interpreted(*arrays):
+        calls.append(len(arrays[0]))
+        return newton_steps(*arrays, interpret=True)
+
+    def as_on_gpus(*arguments, cuda, default):
+        return cuda(*arguments)
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(riccati_gpu, "newton_steps", interpreted)
+    if ndx <= MAX_NDX:
+        monkeypatch.setattr(jax.lax, "platform_dependent", as_on_gpus)
+    folded = jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), arguments)
+    step = jax.jit(jax.vmap(jax.vmap(newton)))(*folded)
+    seen = jax.tree.map(lambda a: a.reshape(6, *a.shape[2:]), step)
+    agree(vars(seen), plain, 1e-4)
+    assert set(calls[-1:]) == ({6} if ndx <= MAX_NDX else set())
+
+
+@pytest.mark.skipif(
+    JAX >= (0, 11),
+    reason="since jax 0.11, Triton kernels are lowered only where there is a GPU",
+)
+@pytest.mark.parametrize("noisy", [True, False])
+def test_it_lowers_for_cuda_without_a_gpu(noisy):
+    arrays = jax.tree.leaves(batch(4, np.float32, noisy))
+    text = jax.jit(newton_steps).trace(*arrays).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("triton") >= 2
