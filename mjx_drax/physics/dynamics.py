@@ -23,7 +23,7 @@ from mjx_drax.base.pytrees import HostOnly
 from mjx_drax.kernels.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
-from mjx_drax.physics.engine import mujoco, rollout
+from mjx_drax.physics.engine import Rollout, mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts
 from mjx_drax.physics.source import Source, binary, model_name
@@ -258,7 +258,7 @@ class MjxDynamics(Dynamics):
         now, sound = np.tile(start, (chains, 1)), np.ones(chains, bool)
         now[:, x] = plan[:, 0]
         steps = np.empty((chains, self.substeps, len(start)))
-        with quiet(), rollout.Rollout(nthread=threads if threads > 1 else 0) as engine:
+        with quiet(), Rollout(nthread=threads if threads > 1 else 0) as engine:
             for k in range(knots):
                 off = self.host_difference(states[:, k], plan[:, k])
                 wanted = u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off)

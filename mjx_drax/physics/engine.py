@@ -12,7 +12,7 @@ APT_EGL = "apt-get install -y --no-install-recommends libegl1 libopengl0 libgl1-
 
 try:
     import mujoco as mujoco
-    from mujoco import rollout as rollout
+    from mujoco.rollout import Rollout as Rollout
 except (AttributeError, ImportError) as error:
     _backend = os.environ.get("MUJOCO_GL")
     if not _backend:

@@ -220,44 +220,18 @@ def geom_name(model: mujoco.MjModel, g: int) -> str:
 
 
 def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
-    """All pairs of geoms between which MuJoCo may make a contact."""
-    if model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
-        return
-    yield from zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
-    type_, affinity, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
-    weld = model.body_weldid[body]
-    parent = model.body_weldid[model.body_parentid[weld]]
-    masks = (type_[:, None] & affinity) | (type_ & affinity[:, None])
-    apart = weld[:, None] != weld
-    if not model.opt.disableflags & _DISABLE.mjDSBL_FILTERPARENT:
-        related = (weld[:, None] == parent) | (parent[:, None] == weld)
-        apart &= ~(related & (weld[:, None] != 0) & (weld != 0))
-    excluded = {int(s) for s in model.exclude_signature}
-    for a, b in np.argwhere(np.triu((masks != 0) & apart, 1)).tolist():
-        low, high = sorted((int(body[a]), int(body[b])))
-        if (low << 16) + high not in excluded:
-            yield a, b
+    """All pairs of geoms between which MuJoCo may make a contact; the lower type comes first."""
+    if not model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+        yield from ((int(a), int(b)) for a, b, _ in geom_pairs(model))
 
 
 _OTHER_CONTACTS = {
-    frozenset(kinds)
-    for kinds in (
-        (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH),
-        (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_MESH),
-        (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
-        (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_MESH),
-        (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER),
-        (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER),
-        (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_CYLINDER),
-        (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID),
-        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER),
-        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_ELLIPSOID),
-        (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CAPSULE),
-        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SPHERE),
-        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_CAPSULE),
-        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_BOX),
-        (_GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_MESH),
-        (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_BOX),
+    tuple(int(getattr(_GEOM, f"mjGEOM_{kind}")) for kind in pair.split())
+    for pair in (
+        *("PLANE MESH", "CAPSULE MESH", "BOX MESH", "MESH MESH", "BOX BOX"),
+        *("SPHERE CYLINDER", "CAPSULE CYLINDER", "ELLIPSOID CYLINDER", "CYLINDER CYLINDER"),
+        *("SPHERE ELLIPSOID", "CAPSULE ELLIPSOID", "ELLIPSOID ELLIPSOID"),
+        *("HFIELD SPHERE", "HFIELD CAPSULE", "HFIELD BOX", "HFIELD MESH"),
     )
 }
 """Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 1."""
@@ -268,54 +242,56 @@ def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]
 
     Found by comparing one step of both in many models: each changed velocities by 2e-5 to 0.7.
     """
-    opt, found = model.opt, []
-
-    def note(condition: Any, text: str) -> None:
-        if np.any(condition):
-            found.append(text)
-
-    note(
-        opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT,
-        'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
-    )
-    note(
-        opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-        'integrator "implicitfast" has other derivatives of velocities in MJX: prefer "Euler"',
-    )
-    note(opt.enableflags & _ENABLE.mjENBL_SLEEP, "bodies do not fall asleep: clear the flag sleep")
-    note(opt.noslip_iterations, "noslip_iterations are not made: set them to 0")
-    note(
-        np.any(model.jnt_stiffnesspoly) or np.any(model.tendon_stiffnesspoly),
-        "polynomial stiffness is left out: use linear springs",
-    )
-    note(
-        np.any(model.dof_dampingpoly) or np.any(model.tendon_dampingpoly),
-        "polynomial damping is left out: use linear dampers",
-    )
-    note(model.actuator_actearly, "early activation (actearly) is left out: set it to false")
-    note(model.actuator_delay, "actuators' delays are left out: remove them")
-    note(model.nplugin, "plugins are left out: remove them")
-    note(
-        np.any(model.actuator_damping) or np.any(model.actuator_armature),
-        "actuators' own damping and armature are left out: give them to the joints",
-    )
-    pair = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
-    note(
-        np.isin(model.eq_type, pair),
-        "connect and weld constraints pull a little differently: prefer joints",
-    )
-    note(model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box")
-    for i in np.flatnonzero(_unknown_sensors(model)):
-        found.append(f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs")
-    if contacts:
-        for a, b in contact_pairs(model):
-            kinds = frozenset((_GEOM(model.geom_type[a]), _GEOM(model.geom_type[b])))
-            if kinds in _OTHER_CONTACTS:
-                found.append(
-                    f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
-                    "differ: use spheres, capsules and planes"
-                )
-                break
+    opt, integrators = model.opt, mujoco.mjtIntegrator
+    pulling = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
+    cases: list[tuple[Any, str]] = [
+        (
+            opt.integrator == integrators.mjINT_IMPLICIT,
+            'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
+        ),
+        (
+            opt.integrator == integrators.mjINT_IMPLICITFAST,
+            'integrator "implicitfast" has other derivatives of velocities in MJX: prefer "Euler"',
+        ),
+        (
+            opt.enableflags & _ENABLE.mjENBL_SLEEP,
+            "bodies do not fall asleep: clear the flag sleep",
+        ),
+        (opt.noslip_iterations, "noslip_iterations are not made: set them to 0"),
+        (
+            np.any(model.jnt_stiffnesspoly) or np.any(model.tendon_stiffnesspoly),
+            "polynomial stiffness is left out: use linear springs",
+        ),
+        (
+            np.any(model.dof_dampingpoly) or np.any(model.tendon_dampingpoly),
+            "polynomial damping is left out: use linear dampers",
+        ),
+        (model.actuator_actearly, "early activation (actearly) is left out: set it to false"),
+        (model.actuator_delay, "actuators' delays are left out: remove them"),
+        (model.nplugin, "plugins are left out: remove them"),
+        (
+            np.any(model.actuator_damping) or np.any(model.actuator_armature),
+            "actuators' own damping and armature are left out: give them to the joints",
+        ),
+        (
+            np.isin(model.eq_type, pulling),
+            "connect and weld constraints pull a little differently: prefer joints",
+        ),
+        (model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box"),
+    ]
+    found = [text for condition, text in cases if np.any(condition)]
+    found += [
+        f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs"
+        for i in np.flatnonzero(_unknown_sensors(model))
+    ]
+    pairs = contact_pairs(model) if contacts else iter(())
+    for a, b in pairs:
+        if (int(model.geom_type[a]), int(model.geom_type[b])) in _OTHER_CONTACTS:
+            found.append(
+                f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
+                "differ: use spheres, capsules and planes"
+            )
+            break
     return found
 
 

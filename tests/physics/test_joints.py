@@ -91,7 +91,7 @@ def test_maps_are_smooth_where_series_take_over():
         np.testing.assert_allclose(quaternion.log(jnp.asarray(end))[0], length, rtol=1e-9)
 
 
-def test_lengths_are_mended():
+def test_quaternions_are_scaled_to_unit_length():
     x, _ = drawn(0)
     long = np.where(np.append(JOINTS.is_quaternion, np.zeros(NV, bool)), 3 * x, x)
     np.testing.assert_allclose(JOINTS.normalized(jnp.asarray(long)), x, atol=1e-12)

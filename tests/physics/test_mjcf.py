@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Trajectory, from_mjcf
-from mjx_drax.method.langevin import evaluate
-from mjx_drax.method.linearize import linearize
+from mjx_drax.base.pytrees import with_host_fields
+from mjx_drax.search.iterate import evaluate
+from mjx_drax.method.model import linearize
 from mjx_drax.models import path
 from mjx_drax.physics import step as physics
+from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.report import check
 from mjx_drax.physics.states import difference, set_state
 from mjx_drax.problem.differentiators import Autodiff
@@ -97,13 +99,13 @@ def test_step_and_jacobians_are_the_c_engines_in_float64(model):
         keys = jax.random.split(jax.random.key(0), K)
         linear = jax.jit(linearize)(at, knots, Autodiff(), keys)
         linear = jax.tree.map(np.asarray, linear)
-    host, substeps = task.dynamics.mj_model, task.dynamics.substeps
+    mj_model, substeps = task.dynamics.mj_model, task.dynamics.substeps
     assert substeps == 2
     for k in range(K):
-        stepped = c_step(host, x[k], u[k], substeps)
+        stepped = c_step(mj_model, x[k], u[k], substeps)
         np.testing.assert_allclose(linear.h[k] + x[k + 1], stepped, atol=1e-10)
         AB = np.hstack([linear.A[k], linear.B[k]])
-        np.testing.assert_allclose(AB, c_jacobian(host, x[k], u[k], substeps), atol=1e-7)
+        np.testing.assert_allclose(AB, c_jacobian(mj_model, x[k], u[k], substeps), atol=1e-7)
 
 
 def test_states_hold_activations():
@@ -211,6 +213,19 @@ def test_another_mass_changes_the_motion_without_recompiling():
     assert evaluate._cache_size() - before == 1
     assert defects[0] == defects[2]
     assert defects[0] != defects[1]
+
+
+def test_the_model_of_the_c_engine_is_no_part_of_the_pytree():
+    xml = path("pendulum").read_text()
+    one, other = (problem(xml).dynamics for _ in range(2))
+    assert one.mj_model is not other.mj_model
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    mapped = jax.tree.map(lambda a: a, one)
+    assert (mapped.mj_model, mapped.origin) == (None, None)
+    again = with_host_fields(mapped, one)
+    assert (again.mj_model, again.origin) == (one.mj_model, xml)
+    assert again.source() == other.source()
+    assert mujoco_model(one) is one.mj_model
 
 
 def test_a_result_fed_back_does_not_recompile():

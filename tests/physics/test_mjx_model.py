@@ -1,4 +1,4 @@
-"""What becomes of a model that MJX does not know: mended, refused, or named among differences."""
+"""Models that MJX does not support: made supported, refused, or named among `differences`."""
 
 from functools import partial
 
@@ -79,7 +79,7 @@ STATES = Samples(
     ],
     ids=["PGS, energy, groups, springs", "CG, dampers", "springs and dampers"],
 )
-def test_what_is_mended_steps_like_the_c_engine(parts):
+def test_what_is_made_supported_steps_like_the_c_engine(parts):
     model = rigid(**parts)
     assert differences(model) == []
     np.testing.assert_allclose(compare(model, STATES).velocity, 0, atol=1e-10)
@@ -271,7 +271,7 @@ CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equa
         ({"more": CONNECT}, "connect and weld"),
         ({"option": 'density="1"', "links": 'fluidshape="ellipsoid"'}, "ellipsoid fluid"),
         ({"more": '<sensor><user name="odd" dim="1"/></sensor>'}, "sensor 'odd' is unknown"),
-        ({"floor": "cylinder"}, "contacts like that of 'floor' with 'ball'|'link'"),
+        ({"floor": "cylinder"}, "contacts like that of 'link' with 'floor'"),
         (
             {
                 "before": f'<asset><mesh name="m" vertex="{TETRAHEDRON}"/></asset>',
@@ -299,7 +299,7 @@ def test_differences_have_a_sentence_each(parts, words):
         model.dof_dampingpoly[0] = 0.1
     found = differences(model)
     assert len(found) == 1, found
-    assert words in found[0] or "contacts like that of 'floor'" in found[0]
+    assert words in found[0]
 
 
 def test_contacts_that_are_left_out_do_not_differ():

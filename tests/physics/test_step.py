@@ -13,9 +13,8 @@ import pytest
 
 from mjx_drax import Autodiff, Smoothed, from_mjcf
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.method.linearize import linearize
-from mjx_drax.physics import states as host
-from mjx_drax.physics.states import Engine
+from mjx_drax.method.model import linearize
+from mjx_drax.physics.states import Engine, difference
 from mjx_drax.problem.trajectory import Trajectory
 
 FLOATING = """
@@ -150,7 +149,7 @@ def assert_steps_like_the_c_engine(model, states, **options):
         for name, parts in states.items():
             x = at(model, **parts)
             end, jacobian = map(np.asarray, expanded(x))
-            off = host.difference(model, end, engine.step(x, control))
+            off = difference(model, end, engine.step(x, control))
             np.testing.assert_allclose(off, 0, atol=1e-9, err_msg=name)
             scale = np.abs(jacobian).max()
             np.testing.assert_allclose(

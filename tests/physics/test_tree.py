@@ -1,4 +1,4 @@
-"""Kinematics and smooth dynamics: what MJX finds by walking along the tree."""
+"""Kinematics and smooth dynamics: what MJX finds by a loop over the levels of the tree."""
 
 import jax
 import jax.numpy as jnp
@@ -24,15 +24,15 @@ FRAMES = ("xanchor", "xaxis", "xpos", "xquat", "xmat", "xipos", "ximat", "geom_x
 def drawn(model, gravity=True):
     """A model, in MuJoCo and on the device, and data at random positions and velocities."""
     if model == EVERY_JOINT:
-        host = mujoco.MjModel.from_xml_string(model)
+        mj_model = mujoco.MjModel.from_xml_string(model)
     else:
-        host = mujoco.MjModel.from_xml_path(str(path(model)))
-    host.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        mj_model = mujoco.MjModel.from_xml_path(str(path(model)))
+    mj_model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     if not gravity:
-        host.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    device, random = mjx.put_model(host, impl="jax"), np.random.default_rng(0)
-    qpos, qvel = (jnp.asarray(random.normal(size=n)) for n in (host.nq, host.nv))
-    return host, device, mjx.make_data(host, impl="jax").replace(qpos=qpos, qvel=qvel)
+        mj_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    device, random = mjx.put_model(mj_model, impl="jax"), np.random.default_rng(0)
+    qpos, qvel = (jnp.asarray(random.normal(size=n)) for n in (mj_model.nq, mj_model.nv))
+    return mj_model, device, mjx.make_data(mj_model, impl="jax").replace(qpos=qpos, qvel=qvel)
 
 
 @pytest.mark.parametrize("model", [EVERY_JOINT, "double_pendulum"])
@@ -52,18 +52,18 @@ def test_frames_are_those_of_mjx(model):
 )
 def test_inertias_velocities_and_bias_forces_are_those_of_the_c_engine(model, gravity):
     with jax.enable_x64(True):
-        host, device, data = drawn(model, gravity)
-        c_data = mujoco.MjData(host)
+        mj_model, device, data = drawn(model, gravity)
+        c_data = mujoco.MjData(mj_model)
         c_data.qpos[:], c_data.qvel[:] = data.qpos, data.qvel
-        mujoco.mj_forward(host, c_data)
+        mujoco.mj_forward(mj_model, c_data)
 
         @jax.jit
         def everything(data):
             data = com_vel(device, com_pos(device, kinematics(device, data)))
             return rne(device, mass_matrix(device, data))
 
-        found, M = everything(data), np.zeros((host.nv, host.nv))
-        mujoco.mj_fullM(host, c_data, M)
+        found, M = everything(data), np.zeros((mj_model.nv, mj_model.nv))
+        mujoco.mj_fullM(mj_model, c_data, M)
         np.testing.assert_allclose(found._impl.M, M, atol=1e-9)
         np.testing.assert_allclose(found._impl.cinert[1:], c_data.cinert[1:], atol=1e-9)
         for name in ("subtree_com", "cdof", "cvel", "cdof_dot", "qfrc_bias"):
