@@ -12,9 +12,8 @@ from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax import Problem, Terms, Trajectory, from_mjcf, guesses
-from mjx_drax.method.metrics import displaced
 from mjx_drax.models import path
-from mjx_drax.physics.mjcf import load
+from mjx_drax.physics.source import load
 
 DT = 0.04  # [s]
 GOAL = np.array([2.5, 0.0, 1.0])  # [m]
@@ -47,7 +46,7 @@ def make(horizon: float = 4.0) -> Problem:
         name="quadrotor",
     )
     guess = Partial(about, problem, through_gates(problem))
-    return replace(problem, aside=replace(problem.aside, guess=guess))
+    return replace(problem, guess=guess)
 
 
 def through_gates(problem: Problem) -> Trajectory:
@@ -64,7 +63,7 @@ def about(problem: Problem, along: Trajectory, key: Array) -> Trajectory:
     key_x, key_u = jax.random.split(key)
     away = SCATTER * jax.random.normal(key_x, (problem.horizon, problem.dynamics.ndx))
     push = SCATTER * jax.random.normal(key_u, along.u.shape)
-    return displaced(problem, along, Trajectory(away, push))
+    return problem.displaced(along, Trajectory(away, push))
 
 
 def effort(data: Any, u: Array) -> Array:

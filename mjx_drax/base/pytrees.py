@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import jax
@@ -11,19 +11,33 @@ import jax
 Static: dict[str, Any] = {"static": True}
 """Metadata of a field that is part of the structure, not a leaf: `field(metadata=Static)`."""
 
+HostOnly: dict[str, Any] = {"host": True}
+"""Metadata of a field that no compiled computation reads, such as a name or a test of replays.
+
+It is no part of the pytree, so another value never recompiles, and it needs a default: what JAX
+gives back has that in its place. `with_host_fields` puts the value back.
+"""
+
+REGISTERED: list[type] = []
+"""All classes that were registered, those of users included."""
+
 Class = TypeVar("Class", bound=type)
+Node = TypeVar("Node")
 
 
 def register_dataclass(cls: Class) -> Class:
-    """Register a dataclass as a pytree; fields with metadata `Static` are not traced.
+    """Register a dataclass as a pytree: fields are traced, but for those of metadata `Static`.
+
+    Fields of metadata `HostOnly` are left out.
 
     The decorator of JAX with the same name makes structures that are equal whatever their class is
     (up to jaxlib 0.11, at least; only their hashes differ): of two classes with the same number of
     traced fields and equal static ones, a compiled function that has seen one of them may run the
     program of this one for the other, now and then, as hashes happen to collide.
     """
-    traced = [field.name for field in fields(cls) if not field.metadata.get("static")]
-    static = [field.name for field in fields(cls) if field.metadata.get("static")]
+    inside = [field for field in fields(cls) if not field.metadata.get("host")]
+    traced = [field.name for field in inside if not field.metadata.get("static")]
+    static = [field.name for field in inside if field.metadata.get("static")]
     names = [*traced, *static]
     keys = [jax.tree_util.GetAttrKey(name) for name in traced]
 
@@ -38,4 +52,18 @@ def register_dataclass(cls: Class) -> Class:
         return cls(**dict(zip(names, (*leaves, *aside), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    REGISTERED.append(cls)
     return cls
+
+
+def with_host_fields(node: Node, like: Node) -> Node:
+    """The node with the `HostOnly` fields of another one of its kind, those inside it included."""
+    changed: dict[str, Any] = {}
+    for field in fields(node):  # type: ignore[arg-type]
+        mine, other = getattr(node, field.name), getattr(like, field.name)
+        if field.metadata.get("host"):
+            changed[field.name] = other
+        elif is_dataclass(mine) and type(mine) is type(other):
+            inner = with_host_fields(mine, other)
+            changed |= {} if inner is mine else {field.name: inner}
+    return replace(node, **changed) if changed else node  # type: ignore[type-var]

@@ -41,18 +41,21 @@ from mjx_drax.base.errors import (
     require_whole,
     shown,
 )
+from mjx_drax.base.numbers import numbers
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.control.shift import shifted
 from mjx_drax.kernels.compilation import compiled
-from mjx_drax.kernels.linalg import exact
-from mjx_drax.kernels.scalarize import pruned
-from mjx_drax.method.langevin import FEASIBLE, Info, Langevin, Scale, State, evaluate, ranking
-from mjx_drax.method.metrics import GaussNewton
-from mjx_drax.physics.states import difference, integrate
-from mjx_drax.problem.problem import Cost, Problem, Stagewise, Trajectory, checked, numbers
-from mjx_drax.search.restarts import Restarts, as_restarts, run, unit_of
-
-AHEAD = 8
-"""Knots that f goes on for behind the last one; a shift by more repeats the state reached."""
+from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.method.descent import Info
+from mjx_drax.method.langevin import Langevin, State
+from mjx_drax.method.schedules import Scale
+from mjx_drax.problem.cost import Cost
+from mjx_drax.problem.problem import Problem, checked
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.engine import Chains, Search, chain_keys
+from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import FEASIBLE, Question, evaluate, loop, partition, ranking
+from mjx_drax.search.restarts import Restarts, settled
 
 CHEAPER = 0.9
 """Another chain is applied if its cost is below that of the one applied by this factor."""
@@ -191,13 +194,13 @@ class MPC:
                 f"bounds of {problem.name} differ from knot to knot, but the horizon recedes: "
                 "give the same ones for all, of shapes (nx,) and (nu,)."
             )
-        self.solver = Restarts() if solver is None else solver
         self.original, self.problem = problem, holding(problem, hold)
-        as_restarts(self.problem, chains, seed, self.solver)
-        if not isinstance(self.solver.flow.preconditioner, GaussNewton):
+        self.solver = settled(self.problem, chains, seed, solver)
+        metric = self.solver.flow.preconditioner
+        if not metric.has_gains:
             raise DraxError(
-                f"preconditioner is {type(self.solver.flow.preconditioner).__name__}, which brings "
-                "no feedback gains: give GaussNewton()."
+                f"preconditioner is {type(metric).__name__}, which brings no feedback gains: give "
+                "GaussNewton(), or a metric with has_gains = True."
             )
         if iterations > self.solver.flow.tail:
             raise DraxError(
@@ -237,17 +240,13 @@ class MPC:
         problem = self.problem.with_x_init(x)
         _require_time(t)
         clock = time.perf_counter()
-        found = run(problem, self.chains, self.seed, self.solver, devices=1)
-        unit = unit_of(np.asarray(found.records[0][1].cost))
-        if isinstance(self.solver, Restarts):
-            self._flow = self.solver.first(unit)
-        else:
-            self._flow = self.solver
+        found = Search(Family.of_one(problem), self.chains, self.seed, self.solver).run()
+        self._flow = found.flow
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
         )
         self._traced = jax.device_put(problem)
-        carried = _first(found.state, found.info, self.explorers, self.seed)
+        carried = _first(found.chains, self.explorers, self.seed)
         self._plan = None
         self._apply(carried, x, t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
@@ -303,7 +302,7 @@ class MPC:
             self.statistics.unmeasured += 1
             return np.clip(np.asarray(plan.u[k], float), self._lower, self._upper)
         planned = self._between(plan.x[k], plan.x[k + 1], s - k)
-        off = np.asarray(self._difference(x, planned), float)
+        off = self.problem.dynamics.host_difference(x, planned)
         return np.clip(plan.u[k] + plan.gains[k] @ off, self._lower, self._upper)
 
     def __call__(self, x: ArrayLike, t: float) -> np.ndarray:
@@ -351,20 +350,10 @@ class MPC:
             raise DraxError(f"the state x has shape {state.shape}: give {nx} numbers, ({nx},).")
         return state
 
-    def _difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """x - y in the tangent space at y, (ndx,), on the host."""
-        dynamics: Any = self.problem.dynamics
-        if dynamics.nx == dynamics.ndx:
-            return x - y
-        return difference(dynamics.mj_model, x, np.asarray(y, float))
-
     def _between(self, x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
         """The state (nx,) a share of the way from x to y, on the host."""
-        if self.problem.dynamics.nx == self.problem.dynamics.ndx:
-            return np.asarray(x + share * (y - x))
-        dynamics: Any = self.problem.dynamics
-        x = np.asarray(x, float)
-        return integrate(dynamics.mj_model, x, share * self._difference(np.asarray(y, float), x))
+        dynamics, x, y = self.problem.dynamics, np.asarray(x, float), np.asarray(y, float)
+        return dynamics.host_integrate(x, share * dynamics.host_difference(y, x))
 
 
 def _require_time(t: float) -> None:
@@ -400,15 +389,15 @@ def _held_residual(
     return held if running is None else jnp.concatenate([jnp.ravel(running(seen, u)), held])
 
 
-def _first(state: State, info: Info, explorers: int, seed: int) -> Carried:
+def _first(found: Chains, explorers: int, seed: int) -> Carried:
     """The chains of a solve, the best ones as keepers; the explorers at all ages."""
-    chains = len(info.cost)
+    info, chains = found.info, len(found.cost)
     count = chains - explorers
     age = np.zeros(chains, np.int32)
     age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
     order = np.lexsort(ranking(info.cost, info.max_defect)[::-1])
     return Carried(
-        _rows(state, order),
+        _rows(found.state, order),
         jnp.int32(0),
         jnp.array(False),
         jnp.int32(count - 1),
@@ -424,7 +413,7 @@ def _rows(state: State, which: ArrayLike) -> State:
 
 
 @partial(compiled, static_argnames="explorers")
-@exact
+@full_precision
 def _plan(
     flow: Langevin,
     heated: Langevin,
@@ -439,7 +428,7 @@ def _plan(
     problem = replace(problem, x_init=x)
     chains, best, age, key = len(carried.age), carried.best, carried.age, carried.key
     exploring = jnp.arange(chains) >= chains - explorers
-    state = jax.vmap(partial(_shifted, flow, problem, by))(carried.state)
+    state = jax.vmap(partial(shifted, flow, problem, by))(carried.state)
     if explorers:
         key, fresh = jax.random.split(key)
         state = _restarted(heated, problem, state, best, exploring & (age == 0), fresh)
@@ -503,8 +492,8 @@ def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) 
     _, (x, u) = jax.lax.scan(follow, problem.x_init, (problem.stages(knots), knots.u, gains))
     rolled = Trajectory(jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0))
     everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
-    moved = flow.moved_to(problem, state, everyone)
-    moved = replace(moved, damping=jnp.ones_like(state.damping))
+    inside = jax.vmap(partial(flow.inside, problem))(everyone)
+    moved = replace(state, trajectory=inside, damping=jnp.ones_like(state.damping))
     which = carried.lost & (carried.spare != best) & (jnp.arange(len(state.alive)) == carried.spare)
     return _where(which, moved, state)
 
@@ -514,7 +503,8 @@ def _restarted(
 ) -> State:
     """The chains (chains,) that are to start again do so from the best one's knots."""
     knots = jax.tree.map(lambda a: jnp.broadcast_to(a[best], a.shape), state.trajectory)
-    started = heated.init(problem, replace(knots, slack=None), key)
+    keys = chain_keys(key, len(which))
+    started = jax.vmap(partial(heated.init, problem))(replace(knots, slack=None), keys)
     return _where(which, started, state)
 
 
@@ -538,68 +528,12 @@ def _iterated(
 ) -> State:
     """So many iterations of every chain, from its own `start` (chains,) in its own schedules."""
 
-    def one(exploring: Array, start: Array, state: State, i: Array) -> State:
-        solver = jax.tree.map(partial(jnp.where, exploring), heated, flow)
-        alone = jax.tree.map(lambda a: a[None], state)
-        return jax.tree.map(lambda a: a[0], solver.step(problem, alone, start + i))
+    def own(old: Array, new: Array) -> Array:
+        which = exploring.reshape(-1, *[1] * jnp.ndim(old))
+        return jnp.where(which, jnp.asarray(new), jnp.asarray(old))
 
-    @pruned  # jit does it to all but the bodies of loops
-    def step(i: Array, state: State) -> State:
-        return jax.vmap(partial(one, i=i))(exploring, start, state)
-
-    return jax.lax.fori_loop(0, iterations, step, state)
-
-
-def _shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
-    """One chain `by` knots later; one that had died starts anew with its multipliers."""
-    dynamics, K = problem.dynamics, problem.horizon
-    knots, multipliers = state.trajectory, state.multipliers
-    place = by + jnp.arange(K)
-    low = jnp.floor(place).astype(jnp.int32)
-    share = place - low
-
-    def rows(a: Array) -> Array:
-        """Rows of (K, ...) at those places, the last one repeated."""
-        one, two = a[jnp.minimum(low, K - 1)], a[jnp.minimum(low + 1, K - 1)]
-        return one + share.reshape(-1, *[1] * (a.ndim - 1)) * (two - one)
-
-    def ahead(x: Array, _: None) -> tuple[Array, Array]:
-        x = dynamics.step(x, knots.u[-1])
-        return x, x
-
-    _, beyond = jax.lax.scan(ahead, knots.x[-1], length=AHEAD)
-    beyond = jnp.where(jnp.isfinite(beyond), beyond, knots.x[-1])
-    inside = flow.bounds.interior(
-        problem.bounds, Trajectory(beyond, jnp.broadcast_to(knots.u[-1], (AHEAD, dynamics.nu)))
-    )
-    x = jnp.concatenate([knots.x, inside.x])
-    one, two = (x[jnp.minimum(low + i, K + AHEAD - 1)] for i in (0, 1))
-    x = jax.vmap(lambda a, b, w: dynamics.integrate(a, w * dynamics.difference(b, a)))(
-        one, two, share
-    )
-
-    def stages(numbers: Stagewise) -> Stagewise:
-        return replace(numbers, stage=rows(numbers.stage))
-
-    def shifted(z: Trajectory) -> Trajectory:
-        slack = None if z.slack is None else stages(z.slack)
-        return Trajectory(rows(z.x), rows(z.u), slack)
-
-    of_bounds = multipliers.bounds
-    if of_bounds is not None:
-        of_bounds = shifted(of_bounds[0]), shifted(of_bounds[1])
-    later = replace(
-        multipliers,
-        dynamics=rows(multipliers.dynamics),
-        constraints=stages(multipliers.constraints),
-        bounds=of_bounds,
-    )
-    return replace(
-        state,
-        trajectory=replace(shifted(knots), x=x),
-        multipliers=jax.tree.map(lambda m: jnp.where(state.alive, m, 0.0), later),
-        damping=jnp.where(state.alive, state.damping, 1.0),
-        gains=rows(state.gains),
-        alive=jnp.ones_like(state.alive),
-        died_at=jnp.full_like(state.died_at, -1),
-    )
+    question = Question(jax.tree.map(own, flow, heated), problem, start)
+    sizes = [len(jax.tree.leaves(part)) for part in question]
+    differs = (True,) * sizes[0] + (False,) * sizes[1] + (True,)
+    shared, rows = partition(question, differs)
+    return loop((state, rows), shared, 0, iterations, diagnose=False)[0]

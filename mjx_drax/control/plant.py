@@ -13,10 +13,11 @@ from itertools import pairwise
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, is_number, require_not_negative, require_positive, shown
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.mjcf import index
+from mjx_drax.base.numbers import numbers
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.source import index
 from mjx_drax.physics.states import Floats, integrate, set_state
-from mjx_drax.problem.problem import Problem, numbers
+from mjx_drax.problem.problem import Problem
 
 LASTS = 0.1
 """How long a push lasts [s], unless it says otherwise."""

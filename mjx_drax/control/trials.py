@@ -229,7 +229,7 @@ def save(numbers: dict[str, Any], folder: Path) -> Path:
 
 def film(problem: Problem, motion: Motion, path: str | os.PathLike[str], **look: Any) -> Path:
     """A film of one run; see `rendering.render_motion`."""
-    from mjx_drax.view.rendering import render_motion
+    from mjx_drax.view.video import render_motion
 
     dynamics: Any = problem.dynamics
     lines_ = [f"{problem.name}, model predictive control", "t = {time}"]

@@ -1,4 +1,7 @@
-"""Three interchangeable ways to keep every iterate inside its bounds.
+"""Ways to keep every iterate inside its bounds: a base class, and three that are interchangeable.
+
+A handling of your own inherits `Bounds` and has one method, `confine`; `interior` and `barred` have
+defaults.
 
 `LogBarrier` adds rho b(z) to the cost, with a weight rho that decays over the solve and
 
@@ -27,7 +30,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.problem.problem import Box, Trajectory
+from mjx_drax.problem.trajectory import Box, Trajectory
 
 FOLLOW = 100.0
 """Largest factor between a bound's multiplier and rho / slack."""
@@ -36,14 +39,32 @@ Sides = tuple[Trajectory, Trajectory]
 """Numbers of the lower and of the upper ends, shaped like the knots."""
 
 
-class _Barrier:
-    """The barrier b and its multipliers, over those ends of the box that it sees."""
+class Bounds:
+    """Keeps knots inside a box, and bars the way to those ends of it that have a barrier.
+
+    Without `barred` of its own, a class has no barrier on states and controls. Slack variables
+    always have theirs, which is what makes an inequality act before it is violated.
+    """
 
     floor: ArrayLike = 1e-6
 
-    def seen(self, box: Box) -> Box:
-        """The box with the ends that have a barrier, the others infinite; slacks have theirs."""
-        return box
+    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+        """`new`, brought into the box; `old` is inside. By default the nearest point of the box."""
+        return _inside(box, slacks_confined(box, old, new), 0.0)
+
+    def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
+        """The knots that a chain starts from, brought into the box."""
+        return _inside(box, trajectory, 0.0)
+
+    def barred(self, box: Box) -> Box:
+        """The box with those ends that have a barrier, the others infinite."""
+        ends = (
+            (box.x_lower, -jnp.inf),
+            (box.x_upper, jnp.inf),
+            (box.u_lower, -jnp.inf),
+            (box.u_upper, jnp.inf),
+        )
+        return Box(*(jnp.full_like(end, value) for end, value in ends))
 
     def value(self, box: Box, trajectory: Trajectory) -> Array:
         """b(z) as one term per knot (u_k, x_{k+1}), (K,)."""
@@ -52,7 +73,7 @@ class _Barrier:
             below, above = self._slack(z - lower), self._slack(upper - z)
             return jnp.sum(jnp.log(below) + jnp.log(above), axis=-1)
 
-        logs = jax.tree.map(log_slacks, trajectory, *self.seen(box).sides(trajectory))
+        logs = jax.tree.map(log_slacks, trajectory, *self.barred(box).sides(trajectory))
         knots = logs.x + logs.u
         if logs.slack is not None:
             knots = (knots + logs.slack.stage).at[-1].add(logs.slack.terminal)
@@ -65,7 +86,7 @@ class _Barrier:
 
         With multipliers v the curvature is v / slack; without, v = rho / slack, it is b's own.
         """
-        lower, upper = self.seen(box).sides(trajectory)
+        lower, upper = self.barred(box).sides(trajectory)
         central = self.multipliers(box, trajectory, weight)
         below, above = multipliers or central
 
@@ -79,7 +100,7 @@ class _Barrier:
 
     def multipliers(self, box: Box, trajectory: Trajectory, weight: ArrayLike) -> Sides:
         """Multipliers of the lower and the upper ends on the central path, v = rho / slack."""
-        lower, upper = self.seen(box).sides(trajectory)
+        lower, upper = self.barred(box).sides(trajectory)
         return (
             jax.tree.map(lambda z, a: weight * _inverse(self._slack(z - a), a), trajectory, lower),
             jax.tree.map(lambda z, b: weight * _inverse(self._slack(b - z), b), trajectory, upper),
@@ -108,7 +129,7 @@ class _Barrier:
             held = jnp.clip(v + step, central / FOLLOW, central * FOLLOW)
             return jnp.where(jnp.isinf(end), 0.0, held)
 
-        lower, upper = self.seen(box).sides(old)
+        lower, upper = self.barred(box).sides(old)
         return (
             jax.tree.map(partial(side, sign=1.0), old, new, lower, multipliers[0]),
             jax.tree.map(partial(side, sign=-1.0), old, new, upper, multipliers[1]),
@@ -121,7 +142,7 @@ class _Barrier:
 
 @register_dataclass
 @dataclass(frozen=True)
-class LogBarrier(_Barrier):
+class LogBarrier(Bounds):
     """The barrier b(z), and a fraction-to-the-boundary rule for steps.
 
     Attributes:
@@ -143,9 +164,49 @@ class LogBarrier(_Barrier):
 
         return jax.tree.map(hold, old, new, lower, upper)
 
-    def interior(self, box: Box, trajectory: Trajectory, margin: float = 1e-2) -> Trajectory:
-        """The nearest trajectory at least `margin` of the box's width away from its ends."""
-        return _inside(box, trajectory, margin)
+    def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
+        """The nearest trajectory at least 1 % of the box's width away from its ends."""
+        return _inside(box, trajectory, 1e-2)
+
+    def barred(self, box: Box) -> Box:
+        """All of it."""
+        return box
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Projection(Bounds):
+    """A step that leaves the box ends at the nearest point of it.
+
+    Meant for `Identity` and `Diagonal`: a Newton step that is clipped afterwards need not descend,
+    so with `GaussNewton` and active bounds the log barrier finds better answers.
+    """
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Reflection(Bounds):
+    """A step that leaves the box is reflected at its walls, as often as it takes."""
+
+    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+        """`new`, folded back into the box."""
+
+        def fold(z: Array, a: Array, b: Array) -> Array:
+            width = jnp.where(jnp.isfinite(b - a) & (b > a), b - a, 1.0)
+            turned = jnp.mod(z - a, 2.0 * width)
+            both = a + jnp.where(turned > width, 2.0 * width - turned, turned)
+            one = jnp.where(jnp.isfinite(a), a + jnp.abs(z - a), b - jnp.abs(b - z))
+            free = jnp.isinf(a) & jnp.isinf(b)
+            folded = jnp.where(jnp.isfinite(b - a), both, jnp.where(free, z, one))
+            return jnp.clip(folded, a, b)  # rounding only
+
+        held = slacks_confined(box, old, new)
+        return jax.tree.map(fold, held, *box.sides(new))
+
+
+def slacks_confined(box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
+    """`new`, its slack variables held by the barrier's rule."""
+    return replace(new, slack=LogBarrier().confine(box, old, new).slack)
 
 
 def _inverse(slack: Array, end: Array) -> Array:
@@ -162,64 +223,3 @@ def _inside(box: Box, trajectory: Trajectory, margin: float) -> Trajectory:
         return jnp.clip(z, a + gap, b - gap)
 
     return jax.tree.map(inside, trajectory, lower, upper)
-
-
-class _WithoutBarrier(_Barrier):
-    """What rules that only act on steps have in common: no barrier on states and controls.
-
-    Slack variables keep theirs, which is what makes an inequality act before it is violated.
-    """
-
-    def seen(self, box: Box) -> Box:
-        """A box without ends."""
-        ends = (
-            (box.x_lower, -jnp.inf),
-            (box.x_upper, jnp.inf),
-            (box.u_lower, -jnp.inf),
-            (box.u_upper, jnp.inf),
-        )
-        return Box(*(jnp.full_like(end, value) for end, value in ends))
-
-    def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
-        """The nearest trajectory inside the box, ends included."""
-        return _inside(box, trajectory, 0.0)
-
-
-def _with_slack_confined(box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
-    """`new`, its slack variables held by the barrier's rule."""
-    return replace(new, slack=LogBarrier().confine(box, old, new).slack)
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Projection(_WithoutBarrier):
-    """A step that leaves the box ends at the nearest point of it.
-
-    Meant for `Identity` and `Diagonal`: a Newton step that is clipped afterwards need not descend,
-    so with `GaussNewton` and active bounds the log barrier finds better answers.
-    """
-
-    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
-        """`new`, clipped to the box."""
-        return _inside(box, _with_slack_confined(box, old, new), 0.0)
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Reflection(_WithoutBarrier):
-    """A step that leaves the box is reflected at its walls, as often as it takes."""
-
-    def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
-        """`new`, folded back into the box."""
-
-        def fold(z: Array, a: Array, b: Array) -> Array:
-            width = jnp.where(jnp.isfinite(b - a) & (b > a), b - a, 1.0)
-            turned = jnp.mod(z - a, 2.0 * width)
-            both = a + jnp.where(turned > width, 2.0 * width - turned, turned)
-            one = jnp.where(jnp.isfinite(a), a + jnp.abs(z - a), b - jnp.abs(b - z))
-            free = jnp.isinf(a) & jnp.isinf(b)
-            folded = jnp.where(jnp.isfinite(b - a), both, jnp.where(free, z, one))
-            return jnp.clip(folded, a, b)  # rounding only
-
-        held = _with_slack_confined(box, old, new)
-        return jax.tree.map(fold, held, *box.sides(new))

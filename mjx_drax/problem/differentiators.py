@@ -18,7 +18,8 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.kernels.linalg import symmetric
-from mjx_drax.kernels.scalarize import pruned, scalarized
+from mjx_drax.kernels.pruning import pruned
+from mjx_drax.kernels.scalarize import scalarized
 
 Function = Callable[[Array], Array]
 

@@ -1,47 +1,53 @@
 """Discrete-time dynamics x_{k+1} = f(x_k, u_k), and the arithmetic of its states.
 
 A state x holds nx numbers. Differences between states live in the tangent space and hold ndx
-numbers; for the vector spaces of this module the two are the same. Everything that is solved for
-(defects, linearizations, multipliers, noise) lives in tangent space, so a state with quaternions
-only has to bring its own `difference` and `integrate`.
+numbers; on a vector space the two are the same. Everything that is solved for (defects,
+linearizations, multipliers, noise) lives in tangent space.
+
+A system of your own is a frozen dataclass under `mjx_drax.register_dataclass` with the fields `dt`,
+`nx` and `nu` and one method, `step`; one whose states are no vectors (angles that wrap, quaternions)
+brings three, `step`, `difference` and `integrate`, and `ndx`. The rest has defaults.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from types import CellType, CodeType, FunctionType, MethodType
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.problem import rollout
 
 
 class Dynamics:
-    """What the solver asks of a system: sizes, f, state arithmetic and what costs see.
-
-    A system is a frozen dataclass under `pytrees.register_dataclass`.
+    """f(x, u), and how states are compared and displaced.
 
     Attributes:
         nx: numbers in a state.
-        ndx: numbers in a difference of states.
+        ndx: numbers in a difference of states; nx by default.
         nu: numbers in a control.
         dt: time between knots [s].
-        derivatives: how f is differentiated, if not as the solver would; see `derivatives`.
+        kinked: whether f has kinks, as contacts make them. Then all chains start near x_init, and
+            the default solver rolls plans out (`Restarts.rollouts`).
+        state_damping: damping of states beside that of controls in `GaussNewton`.
+        checked: f has been tried where it was made, and need not be traced once more.
     """
 
     nx: int
-    ndx: int
     nu: int
     dt: float
-    derivatives: Any = None
+    kinked: bool = False
+    state_damping: float = 1.0
+    checked: bool = False
+
+    @property
+    def ndx(self) -> int:
+        """Numbers in a difference of states."""
+        return self.nx
 
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u): the state (nx,) one knot after x (nx,) under the control u (nu,)."""
@@ -62,27 +68,35 @@ class Dynamics:
     def tangent(self, numbers: Array) -> Array:
         """Of numbers for the entries of a state (..., nx), those for its tangent (..., ndx).
 
-        Bounds are on entries of states; their forces act in tangent space.
+        Bounds are on entries of states; their forces act in tangent space. By default there are
+        none where the two differ in size: such a system needs an own method to have bounds.
         """
-        return numbers
+        return numbers if self.ndx == self.nx else jnp.zeros((*numbers.shape[:-1], self.ndx))
 
     def observe(self, x: Array, u: Array) -> Any:
         """What cost functions receive for the knot (x, u): here the state itself."""
         return x
 
-    @property
-    def kinked(self) -> bool:
-        """Whether f has kinks, as contacts make them: an answer may need `restarts`' mending."""
-        return False
-
     def differentiator(self, by: Any) -> Any:
-        """How functions of one knot of this system are best differentiated, if asked to by `by`."""
+        """How costs and constraints of one knot are differentiated, if asked to by `by`."""
         return by
+
+    def step_differentiator(self, by: Any) -> Any:
+        """How f is differentiated, if asked to by `by`."""
+        return by
+
+    def in_float64(self) -> Any:
+        """The same system, for replays in float64: own functions must not have been traced yet."""
+        return self
 
     @property
     def engine(self) -> str:
         """What replays a result, in words."""
-        raise NotImplementedError
+        return "rollout of f, float64"
+
+    def fingerprint(self) -> bytes:
+        """What replays depend on besides the numbers of the pytree; checkpoints keep its digest."""
+        return b""
 
     def replay(
         self,
@@ -102,40 +116,28 @@ class Dynamics:
         Returns:
             states (chains, K + 1, nx) and the controls that were applied (chains, K, nu).
         """
-        raise NotImplementedError
+        return rollout.replay(self, plan, u, gains, limits)
+
+    def host_difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """`difference` of states (..., nx) on the host, in float64, (..., ndx)."""
+        if type(self).difference is Dynamics.difference:
+            return np.asarray(x - y)
+        return rollout.apply(self, "difference", x, y)
+
+    def host_integrate(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:
+        """`integrate` of states (..., nx) by (..., ndx) on the host, in float64."""
+        if type(self).integrate is Dynamics.integrate:
+            return np.asarray(x + dx)
+        return rollout.apply(self, "integrate", x, dx)
 
     def deviation(self, states: np.ndarray, plan: np.ndarray) -> np.ndarray:
         """max|x - plan| in tangent space, (...,) for states and plan of shape (..., nx)."""
-        return np.abs(states - plan).max(axis=-1)
+        off = self.host_difference(states, np.broadcast_to(plan, states.shape))
+        return np.abs(off).max(axis=-1)
 
     def observe_replayed(self, x: np.ndarray) -> Any:
         """What goal functions receive for a replayed state (nx,): here the state itself."""
         return x
-
-
-def as_partial(function: Callable[..., Any]) -> Partial:
-    """The function as a pytree: static code, traced arguments.
-
-    A `jax.tree_util.Partial` given by the user keeps its bound arguments as traced leaves, which
-    is how a cost or a model takes parameters that may change without recompiling. So does any other
-    callable that is registered as a pytree, like the terms of `mjx_drax.Terms`.
-    """
-    if isinstance(function, Partial):
-        return function
-    if not jax.tree_util.all_leaves([function]):
-        cls: Any = type(function)
-        return Partial(_call_of(cls), function)
-    return Partial(function)
-
-
-@lru_cache
-def _call_of(cls: type) -> Callable[..., Any]:
-    """What calls objects of one class: of two classes the structures may be equal, this is not."""
-
-    def call(function: Callable[..., Any], *arguments: Any) -> Any:
-        return function(*arguments)
-
-    return call
 
 
 @register_dataclass
@@ -148,103 +150,12 @@ class FunctionDynamics(Dynamics):
     nx: int = field(metadata=Static)
     nu: int = field(metadata=Static)
 
-    @property
-    def ndx(self) -> int:  # type: ignore[override]
-        """Differences of vectors are vectors."""
-        return self.nx
-
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u), (nx,)."""
         return self.function(x, u)
 
-    @property
-    def engine(self) -> str:
-        """Functions are rolled out in double precision."""
-        return "rollout of f, float64"
-
-    def replay(
-        self,
-        plan: np.ndarray,
-        u: np.ndarray,
-        gains: np.ndarray,
-        limits: tuple[np.ndarray, np.ndarray],
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """States and controls under u_k + K_k (x_k - plan_k) with f in float64; see `Dynamics`."""
+    def in_float64(self) -> FunctionDynamics:
+        """The same with a function that has not been traced in float32."""
         f = self.function
-        own = replace(self, function=Partial(_with_own_arrays(f.func), *f.args, **f.keywords))
-        with jax.enable_x64(True):
-            states, applied = _replay(*jax.tree.map(_double, (own, plan, u, gains, limits)))
-            return np.asarray(states), np.asarray(applied)
-
-
-def _double(leaf: Any) -> Any:
-    """The same number or array in float64, if it is one of floats."""
-    array = np.asarray(leaf)
-    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else leaf
-
-
-@lru_cache
-def _with_own_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function, with copies of the numpy arrays that it and its helpers refer to.
-
-    JAX knows an array by its identity, in the precision in which it first saw it, and a function
-    that was traced in float32 then fails in float64.
-    """
-    return _copied(function, {})
-
-
-def _copied(value: Any, seen: dict[int, Any]) -> Any:
-    """A copy of arrays, and of containers, methods and functions that hold them; else the same."""
-    if id(value) in seen:
-        return seen[id(value)]
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if type(value) in (list, tuple):
-        return type(value)(_copied(entry, seen) for entry in value)
-    if type(value) is dict:
-        return {key: _copied(entry, seen) for key, entry in value.items()}
-    if isinstance(value, MethodType):
-        owner = copy(value.__self__)
-        for name, entry in vars(value.__self__).items():
-            object.__setattr__(owner, name, _copied(entry, seen))
-        return MethodType(_copied(value.__func__, seen), owner)
-    if not isinstance(value, FunctionType):
-        return value
-    if (value.__module__ or "").split(".")[0] in ("jax", "numpy"):
-        return value
-    names = dict(value.__globals__)
-    cells = tuple(CellType() for _ in value.__closure__ or ())
-    new = FunctionType(value.__code__, names, value.__name__, value.__defaults__, cells)
-    new.__kwdefaults__ = value.__kwdefaults__
-    seen[id(value)] = new
-    for cell, old in zip(cells, value.__closure__ or (), strict=True):
-        cell.cell_contents = _copied(old.cell_contents, seen)
-    for name in _names(value.__code__):
-        if name in names:
-            names[name] = _copied(names[name], seen)
-    return new
-
-
-def _names(code: CodeType) -> set[str]:
-    """Names of globals that a function may use, those of functions inside it included."""
-    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*map(_names, inner))
-
-
-@jax.jit
-def _replay(
-    dynamics: Dynamics, plan: Array, u: Array, gains: Array, limits: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    lower, upper = (jnp.broadcast_to(side, u.shape[1:]) for side in limits)
-
-    def advance(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
-        planned, control, gain, low, high = stage
-        control = jnp.clip(control + gain @ dynamics.difference(x, planned), low, high)
-        x = dynamics.step(x, control)
-        return x, (x, control)
-
-    def chain(plan: Array, u: Array, gains: Array) -> tuple[Array, Array]:
-        states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, lower, upper))[1]
-        return jnp.concatenate([plan[:1], states]), applied
-
-    return jax.vmap(chain)(plan, u, gains)
+        function = Partial(rollout.untraced(f.func), *f.args, **f.keywords)
+        return replace(self, function=function)

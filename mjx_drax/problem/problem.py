@@ -17,206 +17,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import (
-    DraxError,
-    reason,
-    require_positive,
-    require_whole,
-    shown,
-)
-from mjx_drax.base.pytrees import Static, register_dataclass
-from mjx_drax.kernels.linalg import transposed_product
-from mjx_drax.kernels.scalarize import pruned
-from mjx_drax.problem.checks import require_functions, require_shape, traced
-from mjx_drax.problem.differentiators import Differentiator, positive_part
-from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics, as_partial
-
-MOST = 1_000_000
-"""Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
+from mjx_drax.base.errors import DraxError, reason, require_whole, shown
+from mjx_drax.base.numbers import vector
+from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass
+from mjx_drax.kernels.pruning import pruned
+from mjx_drax.problem.cost import Constraint, Cost
+from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.tracing import require_shape
+from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory, Values
 
 CLOSE = 0.03
 """Least factor on the scatter of initial knots of chains that start nearer to x_init."""
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Stagewise:
-    """Numbers that go with constraints: for the stages (..., K, m) and for the end (..., m_end)."""
-
-    stage: Array
-    terminal: Array
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Trajectory:
-    """Knot points: states x_1..x_K (..., K, nx) and controls u_0..u_{K-1} (..., K, nu).
-
-    What a chain carries also has the slack variables s >= 0 of inequalities; a trajectory that a
-    user gives does not.
-    """
-
-    x: Array
-    u: Array
-    slack: Stagewise | None = None
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Values:
-    """What the functions of a problem are at a trajectory.
-
-    Attributes:
-        costs: l(x_k, u_k) and phi(x_K), (K + 1,).
-        defects: h_k, (K, ndx).
-        constraints: [equality; inequality], without slack variables.
-    """
-
-    costs: Array
-    defects: Array
-    constraints: Stagewise
-
-    @property
-    def cost(self) -> Array:
-        """phi(x_K) + sum_k l(x_k, u_k), scalar."""
-        return _total(self.costs)
-
-
-def _total(costs: Array) -> Array:
-    """The sum of l(x_k, u_k) and phi(x_K), (K + 1,)."""
-    return jnp.sum(costs[:-1]) + costs[-1]
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Box:
-    """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free."""
-
-    x_lower: Array
-    x_upper: Array
-    u_lower: Array
-    u_upper: Array
-
-    def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
-        """The lower and the upper end for every knot of a trajectory, as two trajectories."""
-        x, u = trajectory.x, trajectory.u
-        zeros = jax.tree.map(jnp.zeros_like, trajectory.slack)
-        infinite = jax.tree.map(lambda s: jnp.full_like(s, jnp.inf), trajectory.slack)
-
-        def side(of_x: Array, of_u: Array, of_slack: Stagewise | None) -> Trajectory:
-            return Trajectory(
-                jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape), of_slack
-            )
-
-        lower = side(self.x_lower, self.u_lower, zeros)
-        upper = side(self.x_upper, self.u_upper, infinite)
-        return lower, upper
-
-    def violation(self, trajectory: Trajectory) -> Array:
-        """Largest distance by which any knot leaves the box, 0 if none does, scalar."""
-        lower, upper = self.sides(trajectory)
-        out = jax.tree.map(
-            lambda z, a, b: jnp.maximum((a - z).max(initial=0.0), (z - b).max(initial=0.0)),
-            trajectory,
-            lower,
-            upper,
-        )
-        return jnp.maximum(out.x, out.u)
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Cost:
-    """scalar(...) + 1/2 |residual(...)|^2, either part optional.
-
-    A residual is the better way to give a cost: its Gauss-Newton Hessian J'J is positive
-    semidefinite by construction and needs first derivatives only.
-    """
-
-    scalar: Partial | None
-    residual: Partial | None
-
-    def __call__(self, *arguments: Any) -> Array:
-        """The cost, a scalar."""
-        total = jnp.zeros(())
-        if self.scalar is not None:
-            total = total + self.scalar(*arguments)
-        if self.residual is not None:
-            total = total + 0.5 * jnp.sum(jnp.square(self.residual(*arguments)))
-        return total
-
-    def expand(
-        self, at: Callable[[Array], tuple[Any, ...]], size: int, by: Differentiator, key: Array
-    ) -> tuple[Array, Array]:
-        """Gradient (n,) and positive semidefinite Hessian (n, n) in local coordinates.
-
-        `at(dz)` gives the cost's arguments a displacement dz (n,) away from the knot. The residual
-        contributes J'r and J'J; the scalar its gradient, and its Hessian with negative eigenvalues
-        set to zero.
-        """
-        gradient, hessian = jnp.zeros(size), jnp.zeros((size, size))
-        if self.scalar is not None:
-            scalar = self.scalar
-
-            def value(dz: Array) -> Array:
-                return jnp.asarray(scalar(*at(dz)), float)  # also a plain number
-
-            slope, _ = by.jacobian(lambda dz: value(dz)[None], size, key)
-            gradient = gradient + slope[0]
-            hessian = hessian + positive_part(by.hessian(value, size))
-        if self.residual is not None:
-            residual = self.residual
-            jacobian, r = by.jacobian(lambda dz: jnp.ravel(residual(*at(dz))), size, key)
-            gradient = gradient + transposed_product(jacobian, r)
-            hessian = hessian + transposed_product(jacobian, jacobian)
-        return gradient, hessian
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Constraint:
-    """equality(...) = 0 and inequality(...) <= 0, either part optional; rows in that order."""
-
-    equality: Partial | None
-    inequality: Partial | None
-    equalities: int = field(metadata=Static)
-    inequalities: int = field(metadata=Static)
-
-    def __call__(self, *arguments: Any) -> Array:
-        """Both parts in one vector, (equalities + inequalities,)."""
-        parts = [p for p in (self.equality, self.inequality) if p is not None]
-        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
-
-    def with_slack(self, values: Array, slack: Array) -> Array:
-        """The equality constraints [equality; inequality + slack], for values (..., m)."""
-        inequality = values[..., self.equalities :] + slack
-        return jnp.concatenate([values[..., : self.equalities], inequality], axis=-1)
-
-    def violation(self, values: Array) -> Array:
-        """Largest |equality| or positive inequality, scalar; 0 without constraints."""
-        equality = jnp.abs(values[..., : self.equalities]).max(initial=0.0)
-        return jnp.maximum(equality, values[..., self.equalities :].max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class Aside:
-    """What a problem carries for use outside of compiled computations.
-
-    All compare equal: another goal or name does not recompile.
-    """
-
-    goal: Callable[[Any], Any] | None
-    guess: Callable[[Array], Trajectory] | None
-    name: str
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Aside)
-
-    def __hash__(self) -> int:
-        return hash(Aside)
 
 
 @register_dataclass
@@ -236,10 +49,13 @@ class Problem:
         x_init: x_0, (nx,).
         bounds: the box that every knot must keep to.
         scatter: the box that initial knots are drawn from, uniformly.
-        aside: goal, guess and name, which no compiled computation reads.
         horizon: K, number of control knots.
-        near: whether every second chain starts nearer to x_init than the scatter; where f has kinks
-            or states hold quaternions all do anyway.
+        near: share of the chains that start nearer to x_init than the scatter.
+        goal: what a replay must reach: a test of dynamics.observe_replayed(x_K), or None.
+        guess: draws the initial knots of one chain from a key, instead of `scatter`; or None.
+        name: what files and tables call it.
+
+    The last three are read on the host only: another one does not recompile.
     """
 
     dynamics: Dynamics
@@ -250,24 +66,11 @@ class Problem:
     x_init: Array
     bounds: Box
     scatter: Box
-    aside: Aside = field(metadata=Static)
     horizon: int = field(metadata=Static)
-    near: bool = field(default=False, metadata=Static)
-
-    @property
-    def goal(self) -> Callable[[Any], Any] | None:
-        """What a replay must reach: a test of dynamics.observe_replayed(x_K), or None."""
-        return self.aside.goal
-
-    @property
-    def guess(self) -> Callable[[Array], Trajectory] | None:
-        """Draws the initial knots of one chain from a key, instead of `scatter`; or None."""
-        return self.aside.guess
-
-    @property
-    def name(self) -> str:
-        """What files and tables call it."""
-        return self.aside.name
+    near: float = field(default=0.0, metadata=Static)
+    goal: Callable[[Any], Any] | None = field(default=None, metadata=HostOnly)
+    guess: Callable[[Array], Trajectory] | None = field(default=None, metadata=HostOnly)
+    name: str = field(default="problem", metadata=HostOnly)
 
     @property
     def times(self) -> np.ndarray:
@@ -313,7 +116,8 @@ class Problem:
 
     def cost(self, trajectory: Trajectory) -> Array:
         """phi(x_K) + sum_k l(x_k, u_k), scalar."""
-        return _total(self.costs(trajectory))
+        costs = self.costs(trajectory)
+        return jnp.sum(costs[:-1]) + costs[-1]
 
     def defects(self, trajectory: Trajectory) -> Array:
         """h_k = f(x_k, u_k) - x_{k+1} in the tangent space at x_{k+1}, (K, ndx)."""
@@ -328,8 +132,10 @@ class Problem:
         stages = jax.vmap(self.running_constraint)(self.stages(trajectory), trajectory.u)
         return Stagewise(stages, self.end_constraint(trajectory.x[-1]))
 
-    def with_slack(self, values: Stagewise, slack: Stagewise) -> Stagewise:
-        """The equality constraints [equality; inequality + slack]."""
+    def with_slack(self, values: Stagewise, slack: Stagewise | None) -> Stagewise:
+        """The equality constraints [equality; inequality + slack], if there are slacks."""
+        if slack is None:
+            return values
         return Stagewise(
             self.constraint.with_slack(values.stage, slack.stage),
             self.terminal_constraint.with_slack(values.terminal, slack.terminal),
@@ -352,14 +158,25 @@ class Problem:
         end = self.terminal_constraint.violation(values.constraints.terminal)
         return jnp.maximum(defect, jnp.maximum(stage, end))
 
+    def no_change(self, trajectory: Trajectory) -> Trajectory:
+        """The displacement of nothing: zeros in tangent space, (K, ndx) and (K, nu)."""
+        zeros = jax.tree.map(jnp.zeros_like, trajectory)
+        return replace(zeros, x=self.dynamics.tangent(zeros.x))
+
+    def displaced(self, trajectory: Trajectory, change: Trajectory) -> Trajectory:
+        """X + change: the knots moved along a tangent `change`, and slacks with it."""
+        x = jax.vmap(self.dynamics.integrate)(trajectory.x, change.x)
+        slack = jax.tree.map(jnp.add, trajectory.slack, change.slack)
+        return Trajectory(x, trajectory.u + change.u, slack)
+
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.
 
-        They are drawn from the scatter box. Where f has kinks, bodies overlap far from x_init and
-        forces lose all measure; what floats freely may tumble at any speed. There the box is shrunk
-        towards x_init and the middle of the controls, for each chain by another factor from `CLOSE`
-        to 1, uniform in its logarithm. With `near` it is for every second chain: strong motors in
-        light arms need that, while motions that lead far away are found from afar.
+        They are drawn from the scatter box. For a share `near` of the chains the box is shrunk
+        towards x_init and the middle of the controls, for each by another factor from `CLOSE` to 1,
+        uniform in its logarithm: far from x_init bodies overlap and forces lose all measure, what
+        floats freely may tumble at any speed, and strong motors throw light arms about. Motions
+        that lead far away are found from afar.
         """
         if self.guess is not None:
             knots = self.guess(key)
@@ -370,10 +187,9 @@ class Problem:
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         x = box.x_lower + x * (box.x_upper - box.x_lower)
         u = box.u_lower + u * (box.u_upper - box.u_lower)
-        all_near = dynamics.kinked or dynamics.nx != dynamics.ndx
-        if self.near or all_near:
+        if self.near > 0.0:
             power = jax.random.uniform(jax.random.fold_in(key, 2))
-            share = CLOSE ** (power if all_near else jnp.maximum(2.0 * power - 1.0, 0.0))
+            share = CLOSE ** jnp.maximum((power - (1.0 - self.near)) / self.near, 0.0)
             middle = 0.5 * (box.u_lower + box.u_upper)
             x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
         return Trajectory(dynamics.valid(x), u)
@@ -415,288 +231,12 @@ class Problem:
         return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:
-        """The same problem from another initial state (nx,)."""
+        """The same problem from another initial state (nx,).
+
+        Raises:
+            DraxError: it does not fit.
+        """
         return checked(replace(self, x_init=vector("x_init", x_init)))
-
-
-def knots(horizon: float, dt: float) -> int:
-    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
-
-    Raises:
-        DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
-    """
-    for label, value in (("dt", dt), ("horizon", horizon)):
-        require_positive(label, value, "a positive number of seconds")
-    share = float(horizon) / float(dt)
-    if share <= 0.5:
-        raise DraxError(
-            f"horizon is {horizon} s, shorter than one control step: give at least {dt:g} s."
-        )
-    if share >= MOST:
-        raise DraxError(
-            f"horizon is {horizon} s, which is {share:.3g} control steps of {dt:g} s: give less "
-            f"than {MOST:,} steps."
-        )
-    return round(share)
-
-
-def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:
-    """(lower, upper) as given, or infinite for None."""
-    if ends is None:
-        return -np.inf, np.inf
-    try:
-        lower, upper = ends
-    except (TypeError, ValueError) as error:
-        raise DraxError(
-            f"bounds of {label} are {shown(ends)}: give a pair (lower, upper)."
-        ) from error
-    return lower, upper
-
-
-def box(
-    nx: int,
-    nu: int,
-    x: tuple[ArrayLike, ArrayLike] | None = None,
-    u: tuple[ArrayLike, ArrayLike] | None = None,
-) -> Box:
-    """A box from (lower, upper) pairs, scalars or arrays that broadcast to (nx,) and (nu,).
-
-    A side that is None is free.
-    """
-
-    def end(value: ArrayLike, size: int, label: str) -> Array:
-        try:
-            array = numbers(value)
-            if np.isnan(array).any():
-                raise ValueError("NaN is no bound")
-            return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
-        except (TypeError, ValueError) as error:
-            raise DraxError(
-                f"{label} is {shown(value)}: give numbers of shape ({size},), or one for all; -inf "
-                "and inf leave it free."
-            ) from error
-
-    (xl, xu), (ul, uu) = _pair("x", x), _pair("u", u)
-    return Box(
-        end(xl, nx, "lower end of x"),
-        end(xu, nx, "upper end of x"),
-        end(ul, nu, "lower end of u"),
-        end(uu, nu, "upper end of u"),
-    )
-
-
-def cost_of(cost: Callable[..., Any] | None, residual: Callable[..., Any] | None) -> Cost:
-    """A Cost from the functions that a user gives; either or both may be None."""
-    return Cost(
-        None if cost is None else as_partial(cost),
-        None if residual is None else as_partial(residual),
-    )
-
-
-def constraint_of(
-    equality: Callable[..., Any] | None,
-    inequality: Callable[..., Any] | None,
-    arguments: tuple[Any, ...],
-    label: str = "",
-) -> Constraint:
-    """A Constraint from the functions that a user gives; their sizes are traced abstractly."""
-    sizes = []
-    for name, function in (("equality", equality), ("inequality", inequality)):
-        if function is None:
-            sizes.append(0)
-            continue
-        out = traced(f"{label}{name}", function, arguments)
-        sizes.append(int(np.prod(out.shape)))
-    parts = [None if f is None else as_partial(f) for f in (equality, inequality)]
-    return Constraint(parts[0], parts[1], sizes[0], sizes[1])
-
-
-def constraints_of(
-    dynamics: Dynamics,
-    equality: Callable[..., Any] | None,
-    inequality: Callable[..., Any] | None,
-    terminal_equality: Callable[..., Any] | None,
-    terminal_inequality: Callable[..., Any] | None,
-) -> tuple[Constraint, Constraint]:
-    """The constraints of the stages and of the end."""
-    x, u = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu)
-    seen = jax.eval_shape(dynamics.observe, x, u)
-    return (
-        constraint_of(equality, inequality, (seen, u)),
-        constraint_of(terminal_equality, terminal_inequality, (seen,), "terminal_"),
-    )
-
-
-def from_function(
-    f: Callable[[Array, Array], Array],
-    *,
-    x_init: ArrayLike,
-    nu: int,
-    dt: float,
-    horizon: float,
-    running_cost: Callable[..., Any] | None = None,
-    terminal_cost: Callable[..., Any] | None = None,
-    running_residual: Callable[..., Any] | None = None,
-    terminal_residual: Callable[..., Any] | None = None,
-    equality: Callable[..., Any] | None = None,
-    inequality: Callable[..., Any] | None = None,
-    terminal_equality: Callable[..., Any] | None = None,
-    terminal_inequality: Callable[..., Any] | None = None,
-    x_bounds: tuple[ArrayLike, ArrayLike] | None = None,
-    u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
-    x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
-    u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
-    goal: Callable[[Any], Any] | None = None,
-    guess: Callable[[Array], Trajectory] | None = None,
-    name: str = "problem",
-) -> Problem:
-    """A problem whose dynamics are a JAX function f(x (nx,), u (nu,)) -> x_next (nx,).
-
-    Args:
-        f: the dynamics. Parameters that should stay changeable without recompiling are bound with
-            `jax.tree_util.Partial`; the same holds for the costs.
-        x_init: x_0, (nx,).
-        nu: size of a control.
-        dt: control step [s].
-        horizon: duration [s]; K = horizon / dt knots, rounded.
-        running_cost: l(x, u), a scalar, summed over the knots as it stands.
-        terminal_cost: phi(x), a scalar.
-        running_residual: r(x, u) (n,): adds 1/2 |r|^2 to the running cost.
-        terminal_residual: r(x) (n,): adds 1/2 |r|^2 to the terminal cost.
-        equality: c(x, u) (m,), held at 0 at every stage k = 0..K-1.
-        inequality: g(x, u) (m,), held <= 0 at every stage.
-        terminal_equality: c(x) (m,), held at 0 at x_K.
-        terminal_inequality: g(x) (m,), held <= 0 at x_K.
-        x_bounds: (lower, upper) on every x_k, k >= 1.
-        u_bounds: (lower, upper) on every u_k.
-        x_scatter: box from which initial states are drawn; by default the bounds, and within
-            +-1 of x_init where those are infinite.
-        u_scatter: the same for controls; within +-1 of 0 where the bounds are infinite.
-        goal: goal(x_K) -> bool, what a replay must reach.
-        guess: guess(key) -> Trajectory, instead of the scatter boxes.
-        name: used in files and tables.
-
-    Raises:
-        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one; a function
-            that computes something else when it is traced again.
-    """
-    require_functions(
-        f=f,
-        running_cost=running_cost,
-        terminal_cost=terminal_cost,
-        running_residual=running_residual,
-        terminal_residual=terminal_residual,
-        equality=equality,
-        inequality=inequality,
-        terminal_equality=terminal_equality,
-        terminal_inequality=terminal_inequality,
-        goal=goal,
-        guess=guess,
-    )
-    if f is None:
-        raise DraxError("f is None: give the dynamics, a function f(x, u) -> x_next.")
-    require_whole("nu", nu)
-    if nu > MOST:
-        raise DraxError(f"nu is {nu}, the size of a control: give at most {MOST:,}.")
-    require_name(name)
-    K = knots(horizon, dt)
-    x_init = vector("x_init", x_init)
-    nx = x_init.shape[0]
-    bounds = box(nx, nu, x_bounds, u_bounds)
-    dynamics = FunctionDynamics(as_partial(f), dt, nx, nu)
-    constraint, terminal_constraint = constraints_of(
-        dynamics, equality, inequality, terminal_equality, terminal_inequality
-    )
-    return checked(
-        Problem(
-            dynamics=dynamics,
-            running=cost_of(running_cost, running_residual),
-            terminal=cost_of(terminal_cost, terminal_residual),
-            constraint=constraint,
-            terminal_constraint=terminal_constraint,
-            x_init=x_init,
-            bounds=bounds,
-            scatter=scatter_box(bounds, x_init, jnp.ones(nx), x_scatter, u_scatter),
-            aside=Aside(goal, guess, name),
-            horizon=K,
-        )
-    )
-
-
-def require_name(name: object) -> None:
-    """Complain about a name that is no text.
-
-    Raises:
-        DraxError: naming its value.
-    """
-    if not isinstance(name, str) or not name:
-        raise DraxError(f"name is {shown(name)}: give a text.")
-
-
-def numbers(value: ArrayLike) -> np.ndarray:
-    """Real numbers as float64.
-
-    Raises:
-        TypeError, ValueError: they are none, or lists of different lengths.
-    """
-    array = np.asarray(value)
-    if array.dtype.kind in "USc":  # strings would be parsed, imaginary parts dropped
-        raise TypeError(f"{array.dtype} holds no real numbers")
-    try:
-        return np.asarray(array, float)
-    except OverflowError as error:  # of Python's own whole numbers
-        raise ValueError(str(error)) from error
-
-
-def vector(label: str, value: ArrayLike) -> Array:
-    """A finite float vector (n,), or a DraxError that says what was given."""
-    if isinstance(value, jax.core.Tracer):
-        raise DraxError(
-            f"{label} is traced, so its numbers cannot be checked: use "
-            f"dataclasses.replace(problem, {label}=...) inside of JAX functions."
-        )
-    try:
-        array = numbers(value)
-    except (TypeError, ValueError) as error:
-        raise DraxError(f"{label} is {shown(value)}: give a vector of numbers.") from error
-    with np.errstate(over="ignore"):  # a number that float32 cannot hold becomes infinite
-        out = jnp.asarray(array)
-    if array.ndim != 1 or not np.isfinite(out).all():
-        raise DraxError(f"{label} is {shown(value)}: give a vector of finite numbers.")
-    return out
-
-
-def scatter_box(
-    bounds: Box,
-    x_init: Array,
-    reach: Array,
-    x: tuple[ArrayLike, ArrayLike] | None,
-    u: tuple[ArrayLike, ArrayLike] | None,
-) -> Box:
-    """The box for initial knots: what is asked for, else the bounds, else x_init +- reach (nx,)."""
-    nx, nu = x_init.shape[0], bounds.u_lower.shape[-1]
-    given = box(nx, nu, x, u)
-
-    @jax.jit
-    def ends(
-        asked: tuple[Array, Array], bound: tuple[Array, Array], middle: Array, reach: Array
-    ) -> tuple[Array, Array]:
-        low, high = (jnp.where(jnp.isfinite(a), a, b) for a, b in zip(asked, bound, strict=True))
-        # Where an end is free: next to the other one, or about the middle if both are.
-        middle = jnp.clip(middle, low + reach, high - reach)
-        return (
-            jnp.where(jnp.isfinite(low), low, middle - reach),
-            jnp.where(jnp.isfinite(high), high, middle + reach),
-        )
-
-    x_ends = ends((given.x_lower, given.x_upper), (bounds.x_lower, bounds.x_upper), x_init, reach)
-    u_ends = ends(
-        (given.u_lower, given.u_upper),
-        (bounds.u_lower, bounds.u_upper),
-        jnp.zeros(nu),
-        jnp.ones(nu),
-    )
-    return Box(x_ends[0], x_ends[1], u_ends[0], u_ends[1])
 
 
 def checked(problem: Problem) -> Problem:
@@ -726,7 +266,7 @@ def checked(problem: Problem) -> Problem:
     if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
         raise DraxError(f"{name} has no cost: give a running or a terminal one.")
     for label, function, arguments, shape in functions_of(problem):
-        if function != dynamics.step or not hasattr(dynamics, "mj_model"):  # MJX's takes a second
+        if function != dynamics.step or not dynamics.checked:  # tracing MJX takes a second
             require_shape(label, function, arguments, shape)
     _check_guess(problem)
     problem.reached(np.asarray(problem.x_init, float))

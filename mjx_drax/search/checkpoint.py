@@ -19,14 +19,11 @@ Files are .npz, of numbers only: reading one runs no code.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import sys
 import time
 import warnings
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +31,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_drax import __version__
+from mjx_drax.base.digests import DIGEST, digest, plain_array, versions
 from mjx_drax.base.errors import DraxError, DraxWarning
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.base.files import require_room as require_room_for
-from mjx_drax.physics.source import binary
 from mjx_drax.problem.problem import Problem
 
 EVERY = 30.0
@@ -47,13 +43,11 @@ EVERY = 30.0
 SHARE = 0.05
 """Largest share of a solve's time that writing them may take; beyond, fewer are written."""
 
-FORMAT = 1
+FORMAT = 2
 """Changes whenever files that were written before can no longer be read."""
 
 HEADERS = 1_000_000
 """Bytes that a file may have beside its arrays."""
-
-_DIGEST = "sha256:"
 
 
 class Checkpoint:
@@ -98,7 +92,7 @@ class Checkpoint:
             if before == value:
                 continue
             what = f"other {name} than this solve has"
-            if not str(value).startswith(_DIGEST) and before is not None:
+            if not str(value).startswith(DIGEST) and before is not None:
                 what = f"{name} {before}, and this solve has {name} {value}"
             raise DraxError(
                 f"{str(self.path)!r} was written for {what}: choose another file, or delete it."
@@ -132,7 +126,7 @@ class Checkpoint:
         if not now and clock < self._due:
             return
         leaves = jax.tree_util.tree_leaves_with_path(tree())
-        arrays = {_name(path): _plain(leaf) for path, leaf in leaves}
+        arrays = {_name(path): plain_array(leaf) for path, leaf in leaves}
         try:
             with complete(self.path) as partial, open(partial, "wb") as file:
                 np.savez(file, question=json.dumps(self.question), **arrays)  # type: ignore[arg-type]
@@ -144,57 +138,27 @@ class Checkpoint:
         self._due = after + max(EVERY, (after - clock) / SHARE)
 
 
-def facts(problem: Problem, chains: int, seed: int, solver: Any) -> dict[str, Any]:
+def facts(problem: Problem, chains: int, seed: int, settings: Any) -> dict[str, Any]:
     """What is known of a question before anything is compiled, by names.
 
     Args:
         problem: its leaves may have a leading axis of problems.
         chains: for each problem.
         seed: of all random numbers.
-        solver: the settings, a `Restarts`.
+        settings: as plain data.
     """
-    from mjx_drax.search.settings import to_data
-
     leaves = jax.tree_util.tree_leaves_with_path(problem)
-    model = getattr(problem.dynamics, "mj_model", None)
+    model = problem.dynamics.fingerprint()
     return {
         "chains": int(chains),
         "seed": int(seed),
-        **_flat("settings", to_data(solver)),
+        **_flat("settings", settings),
         **_flat("version", versions()),
         "device": jax.devices()[0].device_kind,
         "horizon": problem.horizon,
         **{f"numbers in problem.{_name(path)}": digest(leaf) for path, leaf in leaves},
-        **({} if model is None else {"numbers in the MuJoCo model": digest(binary(model))}),
+        **({"numbers in the MuJoCo model": digest(model)} if model else {}),
     }
-
-
-def versions() -> dict[str, str]:
-    """Of what computes an answer."""
-    return {
-        "python": sys.version.split()[0],
-        "mjx-drax": __version__,
-        **{name: version(name) for name in ("jax", "mujoco", "mujoco-mjx", "numpy")},
-    }
-
-
-def digest(tree: Any) -> str:
-    """Of bytes, of a text, or of all numbers in a tree with their shapes and types."""
-    if isinstance(tree, bytes | str):
-        content = tree if isinstance(tree, bytes) else tree.encode()
-        return _DIGEST + hashlib.sha256(content).hexdigest()
-    whole = hashlib.sha256()
-    for leaf in map(_plain, jax.tree.leaves(tree)):
-        whole.update(f"{leaf.dtype} {leaf.shape}".encode())
-        whole.update(leaf.tobytes())
-    return _DIGEST + whole.hexdigest()
-
-
-def _plain(leaf: Any) -> np.ndarray:
-    """A leaf as an array of numpy's, random keys as their numbers."""
-    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    return np.asarray(leaf)
 
 
 def _name(path: Any) -> str:

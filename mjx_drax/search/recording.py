@@ -16,16 +16,18 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.base.errors import require_whole
-from mjx_drax.kernels.linalg import exact
-from mjx_drax.method.langevin import Info, Langevin, ranking
-from mjx_drax.problem.problem import Problem, Trajectory
+from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.method.descent import Info
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.iterate import ranking
 
 LIMIT = 500_000_000
 """Bytes that recordings may take. Beyond, every second snapshot is dropped."""
 
 
 @jax.jit
-@exact
+@full_precision
 def knot_defects(problem: Problem, trajectory: Trajectory) -> Array:
     """max|h_k| over the coordinates of each knot's defect, (chains, K), for a batch of chains."""
     return jax.vmap(lambda z: jnp.abs(problem.defects(z)).max(axis=1))(trajectory)
@@ -145,13 +147,11 @@ class Recorder:
         """An attempt begins, in which each place in the batch works for the chain in owners."""
         self.attempts.append(Tries(owners))
 
-    def take(
-        self, problem: Problem, flow: Langevin, step: int, done: int, z: Trajectory, info: Info
-    ) -> None:
-        """A snapshot after `step` iterations of an attempt, `done` of the solve."""
+    def take(self, problem: Problem, sigma: float, done: int, z: Trajectory, info: Info) -> None:
+        """A snapshot after `done` iterations of the solve, at the noise sigma."""
         snapshot = Snapshot(
             done,
-            flow.sigma(step),
+            sigma,
             np.asarray(z.x),
             np.asarray(knot_defects(problem, z)),
             np.asarray(info.cost),

@@ -1,258 +1,165 @@
-"""Handing a solution on: states and controls as CSV, keyframes as MJCF, trajectories as HDF5.
+"""Exporters: each writes a solution into a file of one format. A user's own is a subclass.
 
-What is handed on is what was replayed, not what was planned; a dataset holds both.
+Nothing heavy is imported here, so that the help of the command line lists exporters at once.
 """
 
 from __future__ import annotations
 
-import csv
 import os
-from collections.abc import Iterator, Sequence
+import sys
+from importlib import import_module
 from pathlib import Path
-from typing import Any
-from xml.sax.saxutils import quoteattr
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import numpy.typing as npt
+from mjx_drax.base.errors import DraxError, reason, shown
 
-from mjx_drax import __version__
-from mjx_drax.base.errors import DraxError
-from mjx_drax.base.files import complete, require
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.problem.problem import Problem
-from mjx_drax.solution.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
-
-DATASET_FORMAT = 1
-"""Of HDF5 files; changes whenever what they hold is named or shaped otherwise."""
-
-_POSITIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
-}
-_VELOCITIES = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
-}
+if TYPE_CHECKING:
+    from mjx_drax.problem.problem import Problem
+    from mjx_drax.solution.solution import Solution
 
 
-# Names
+class NothingToExport(DraxError):
+    """A solution holds nothing that this exporter could write; others may still write theirs."""
 
 
-def state_names(dynamics: Dynamics) -> list[str]:
-    """Names of the entries of a state, nx of them.
+class Exporter:
+    """Writes a solution into a file of one format; a subclass defines what is below.
 
-    For a model qpos_JOINT, qvel_JOINT and act_ACTUATOR, in MuJoCo's units; joints with several
-    coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise x0,
-    x1, ...
+    Attributes:
+        name: by which the exporter is called; the last class that is defined with a name has it.
+        file: name of the file, unless another one is asked for.
+        summary: what the file holds, in a few words.
     """
-    model = getattr(dynamics, "mj_model", None)
-    if model is None:
-        return [f"x{i}" for i in range(dynamics.nx)]
-    return [
-        *_joint_names(model, "qpos", _POSITIONS),
-        *_joint_names(model, "qvel", _VELOCITIES),
-        *_activation_names(model),
-    ]
+
+    name: str = ""
+    file: str = ""
+    summary: str = ""
+
+    def check(self, problem: Problem) -> None:
+        """Complain before a solve about a problem whose solutions cannot be written.
+
+        Raises:
+            DraxError: naming what is missing, such as a package or the problem's model.
+        """
+
+    def write(self, solution: Solution, path: Path) -> None:
+        """Write a solution; `base.files.complete` gives a file that appears once it is complete.
+
+        Raises:
+            NothingToExport: the solution holds nothing of what this file is for.
+            DraxError: the file cannot be written.
+        """
+        raise NotImplementedError
 
 
-def control_names(dynamics: Dynamics) -> list[str]:
-    """Names of the entries of a control, nu of them: ctrl_ACTUATOR, or u0, u1, ..."""
-    model = getattr(dynamics, "mj_model", None)
-    if model is None:
-        return [f"u{i}" for i in range(dynamics.nu)]
-    return [f"ctrl_{model.actuator(i).name or i}" for i in range(model.nu)]
+class Csv(Exporter):
+    """The best chain's replay as a table."""
+
+    name, file = "csv", "replay.csv"
+    summary = "times, states and controls of the replay as a table"
+
+    def write(self, solution: Solution, path: Path) -> None:
+        """Write the table; see `formats.save_csv`."""
+        from mjx_drax.solution.formats import save_csv
+
+        save_csv(solution, path)
 
 
-def _joint_names(
-    model: mujoco.MjModel, kind: str, parts: dict[int, tuple[str, ...]]
-) -> Iterator[str]:
-    for i in range(model.njnt):
-        name = f"{kind}_{model.joint(i).name or i}"
-        for part in parts.get(int(model.jnt_type[i]), ("",)):
-            yield f"{name}_{part}" if part else name
+class Keyframes(Exporter):
+    """The best chain's replay as MJCF."""
+
+    name, file = "keyframes", "keyframes.xml"
+    summary = "the model with the replay as keyframes, for MuJoCo's viewers"
+
+    def check(self, problem: Problem) -> None:
+        """Complain about a problem without MJCF."""
+        from mjx_drax.solution.formats import mjcf_of
+
+        mjcf_of(problem)
+
+    def write(self, solution: Solution, path: Path) -> None:
+        """Write the model; see `formats.export_keyframes`."""
+        from mjx_drax.solution.formats import export_keyframes
+
+        export_keyframes(solution, path)
 
 
-def _activation_names(model: mujoco.MjModel) -> Iterator[str]:
-    for i in range(model.nu):
-        name, count = model.actuator(i).name or i, int(model.actuator_actnum[i])
-        for part in range(count):
-            yield f"act_{name}" if count == 1 else f"act_{name}_{part}"
+class Dataset(Exporter):
+    """The certified chains as HDF5."""
+
+    name, file = "dataset", "dataset.h5"
+    summary = 'all certified chains as HDF5; pip install "mjx-drax[dataset]"'
+
+    def check(self, problem: Problem) -> None:
+        """Complain if h5py is not installed."""
+        from mjx_drax.solution.formats import require_h5py
+
+        require_h5py()
+
+    def write(self, solution: Solution, path: Path) -> None:
+        """Write the chains; see `formats.save_dataset`."""
+        from mjx_drax.solution.formats import save_dataset
+
+        save_dataset(solution, path)
 
 
-# CSV
-
-
-def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
-    """Write the best chain's replay as a table, one row a knot; returns its path.
-
-    Columns: time [s], then `state_names` and `control_names`. Row k holds x_k and the control u_k
-    that acts from there; the last row has no control.
-
-    Args:
-        solution: from `solve`.
-        path: where to, ending in .csv.
+def exporters() -> dict[str, Exporter]:
+    """One exporter of each named subclass of `Exporter` in the modules imported so far, by name.
 
     Raises:
-        DraxError: the path cannot be written.
+        DraxError: a class that cannot be used.
     """
-    states, controls = solution.replayed
-    dynamics = solution.problem.dynamics
-    with complete(path, (".csv",)) as partial, partial.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["time", *state_names(dynamics), *control_names(dynamics)])
-        for k, (time, x) in enumerate(zip(solution.problem.times, states, strict=True)):
-            u = controls[k] if k < len(controls) else [""] * dynamics.nu
-            table.writerow([f"{time:.9g}", *x, *u])
-    return Path(path).expanduser()
+    classes = Exporter.__subclasses__()
+    for each in classes:  # the list grows: subclasses of subclasses too
+        classes += each.__subclasses__()
+    return {each.name: _made(each) for each in classes if each.name}
 
 
-# Keyframes
+def exporter(text: str) -> Exporter:
+    """The exporter of a name in `exporters`, or of a class given as MODULE:CLASS.
 
-
-def require_mjcf(problem: Problem) -> None:
-    """Complain about a problem whose model cannot be written as MJCF; call it before a solve.
+    The module may also lie in the current folder.
 
     Raises:
-        DraxError: the problem has no model, or its MJCF is not known or has changed.
+        DraxError: there is no such exporter, or its module or class cannot be used.
     """
-    host = getattr(problem.dynamics, "host", None)
-    if host is None:
+    found = exporters()
+    if text in found:
+        return found[text]
+    module, colon, name = text.partition(":")
+    if not (module and colon and name):
         raise DraxError(
-            f"{problem.name} has no MuJoCo model to write keyframes of, its dynamics are a "
-            "function: see --csv or save_csv."
+            f"there is no exporter {shown(text)}: give one of {', '.join(found)}, or a class of "
+            "your own as MODULE:CLASS."
         )
-    host.source()
-
-
-def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
-    """Write the model with the replay as its keyframes, for any MuJoCo viewer; returns the path.
-
-    Keyframe `replay_k` holds time, qpos, qvel, act and ctrl at knot k, after those that the model
-    has. Meshes, textures and height fields are copied into a folder beside the file, NAME_assets,
-    so both can be moved together. Other numbers of the model are as MuJoCo writes them, with six
-    digits.
-
-    Args:
-        solution: from `solve`, of a problem from an MJCF file or string.
-        path: where to, ending in .xml.
-
-    Raises:
-        DraxError: there is no MJCF, it has changed since, or the path cannot be written.
-    """
-    require_mjcf(solution.problem)
-    target = Path(path).expanduser()
-    source = solution.problem.dynamics.host.source()  # type: ignore[attr-defined]
-    folder = f"{target.stem}_assets"
-    before, end, _ = source.in_folder(folder if source.assets else "").xml.rpartition("</mujoco>")
-    keys = "\n".join(_keys(solution))
-    with complete(target, (".xml",)) as partial:
-        for name, content in source.assets.items():
-            with complete(target.parent / folder / name) as file:
-                file.write_bytes(content)
-        text = f"{before}  <keyframe>\n{keys}\n  </keyframe>\n{end}\n"
-        partial.write_text(text, encoding="utf-8")
-    return target
-
-
-def _keys(solution: Solution) -> Iterator[str]:
-    """One element a knot; the last one keeps the last control."""
-    model = solution.problem.dynamics.mj_model  # type: ignore[attr-defined]
-    states, controls = solution.replayed
-    for k, (time, x) in enumerate(zip(solution.problem.times, states, strict=True)):
-        if not np.isfinite(x).all():
-            break
-        qpos, qvel, act = np.split(x, [model.nq, model.nq + model.nv])
-        parts = {
-            "qpos": qpos,
-            "qvel": qvel,
-            "act": act,
-            "ctrl": controls[min(k, len(controls) - 1)],
-        }
-        numbers = "".join(f" {n}={quoteattr(_numbers(v))}" for n, v in parts.items() if v.size)
-        yield f'    <key name="replay_{k}" time="{time:.9g}"{numbers}/>'
-
-
-def _numbers(values: npt.ArrayLike) -> str:
-    return " ".join(f"{v:.17g}" for v in np.nan_to_num(np.asarray(values, float)))
-
-
-# Datasets
-
-
-def save_dataset(
-    solutions: Solution | Sequence[Solution],
-    path: str | os.PathLike[str],
-    everything: bool = False,
-) -> Path:
-    """Write trajectories of many chains as HDF5, for learning from; returns the path.
-
-    One group a solution, `000_NAME`, with n trajectories of K knots: times (K+1,); states (n, K+1,
-    nx) and controls (n, K, nu) as replayed, float64; plan_states, plan_controls and gains (n, K,
-    nu, ndx), float32; mode (n,), `open loop` where that succeeds, else `with feedback`; and of that
-    replay max_deviation, final_deviation, max_violation, replay_cost and success, (n,) each; chain,
-    cost and max_defect of the plan, feasible. Attributes: problem, engine, seed, dt, state_names,
-    control_names; of the file: format, mjx_drax.
-
-    Args:
-        solutions: one, or several, from `solve` or `Solution.load`.
-        path: where to, ending in .h5 or .hdf5.
-        everything: also chains that are not certified; otherwise only those that are feasible and
-            whose replay in that mode succeeds.
-
-    Raises:
-        DraxError: h5py is not installed, nothing is certified, or the path cannot be written.
-    """
-    require("h5py", "dataset", "a dataset")
-    import h5py
-
-    solutions = [solutions] if isinstance(solutions, Solution) else list(solutions)
-    tables = [_trajectories(solution, everything) for solution in solutions]
-    if not sum(len(table["chain"]) for table in tables):
+    sys.path.append(os.getcwd())
+    try:
+        each: Any = getattr(import_module(module), name)
+    except Exception as failure:  # the user's module may raise anything
         raise DraxError(
-            "no chain is certified, so the dataset would be empty: solve with more chains, or pass "
-            "everything=True for what there is."
+            f"the exporter {shown(text)} cannot be imported: {reason(failure)}. Give MODULE:CLASS, "
+            "of a module that is installed or lies in the current folder."
+        ) from failure
+    finally:
+        sys.path.remove(os.getcwd())
+    if not (isinstance(each, type) and issubclass(each, Exporter)):
+        raise DraxError(
+            f"the exporter {shown(text)} is {shown(each)}: give a subclass of mjx_drax.Exporter."
         )
-    with complete(path, (".h5", ".hdf5")) as partial, h5py.File(partial, "w") as file:
-        file.attrs["format"], file.attrs["mjx_drax"] = DATASET_FORMAT, __version__
-        for i, (solution, table) in enumerate(zip(solutions, tables, strict=True)):
-            problem = solution.problem
-            group = file.create_group(f"{i:03d}_{problem.name.replace('/', '_')}")
-            group.attrs["problem"], group.attrs["engine"] = problem.name, solution.engine
-            group.attrs["seed"], group.attrs["dt"] = solution.seed, float(problem.dynamics.dt)
-            group.attrs["state_names"] = state_names(problem.dynamics)
-            group.attrs["control_names"] = control_names(problem.dynamics)
-            for name, values in {"times": problem.times, **table}.items():
-                group.create_dataset(name, data=values)
-    return Path(path).expanduser()
+    return _made(each)
 
 
-def _trajectories(solution: Solution, everything: bool) -> dict[str, Any]:
-    """The trajectories of one solution, cheapest first, replayed in their modes."""
-    open_loop, feedback = solution.open_loop, solution.feedback
-    order = np.argsort(solution.cost, kind="stable")
-    chains = order[solution.certified_chains[order] | everything]
-    is_open = open_loop.success[chains]
-
-    def replayed(name: str) -> np.ndarray:
-        one, other = getattr(open_loop, name)[chains], getattr(feedback, name)[chains]
-        return np.where(is_open.reshape(-1, *[1] * (one.ndim - 1)), one, other)
-
-    plans = np.asarray(solution.problem.with_start(solution.trajectories))
-    return {
-        "states": replayed("states"),
-        "controls": replayed("controls"),
-        "plan_states": plans[chains],
-        "plan_controls": solution.trajectories.u[chains],
-        "gains": solution.gains[chains],
-        "mode": [OPEN_LOOP if o else WITH_FEEDBACK for o in is_open],
-        "max_deviation": replayed("max_deviation"),
-        "final_deviation": replayed("final_deviation"),
-        "max_violation": replayed("max_violation"),
-        "replay_cost": replayed("cost"),
-        "success": replayed("success"),
-        "chain": chains,
-        "cost": solution.cost[chains],
-        "max_defect": solution.max_defect[chains],
-        "feasible": solution.feasible[chains],
-    }
+def _made(each: type[Exporter]) -> Exporter:
+    """An exporter of a class, if the class defines all that it must."""
+    missing = "file" if not each.file else "write(solution, path)"
+    if not each.file or each.write is Exporter.write:
+        raise DraxError(
+            f"the exporter {each.__name__} has no {missing}: define it, as mjx_drax.Exporter says."
+        )
+    try:
+        return each()
+    except TypeError as failure:
+        raise DraxError(
+            f"the exporter {each.__name__} cannot be made: {reason(failure)}. Let its class take "
+            "no arguments."
+        ) from failure

@@ -1,4 +1,4 @@
-"""Solutions from the files that `results.save` wrote.
+"""Solutions from the files that `save` wrote.
 
 A solution that is loaded without its problem gets a stand-in: with the sizes, times, bounds and,
 for MJCF, the model of what was solved. Whatever needs a function of the problem raises a DraxError.
@@ -12,7 +12,7 @@ import json
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,23 +27,29 @@ from mjx_drax.base.errors import (
     shown,
 )
 from mjx_drax.base.files import file_path
-from mjx_drax.method.langevin import Langevin
-from mjx_drax.method.metrics import Multipliers
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.mjcf import HostModel, MjxDynamics, bounded_joints
-from mjx_drax.physics.mjx_model import twin
+from mjx_drax.method.model import Multipliers
+from mjx_drax.physics.dynamics import MjxDynamics
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.mjx_model import bounded_joints, put_model
 from mjx_drax.physics.source import Source, from_binary
+from mjx_drax.problem.cost import Constraint, Cost
 from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
-from mjx_drax.problem.problem import Aside, Box, Constraint, Cost, Problem, Stagewise, Trajectory
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.search.settings import from_data
+from mjx_drax.solution.replay import Replays
 from mjx_drax.solution.save import ARRAYS, FORMAT, SUMMARY, json_digest
-from mjx_drax.solution.solution import Replays, Solution
+
+if TYPE_CHECKING:
+    from mjx_drax.solution.solution import Solution
 
 Arrays = dict[str, np.ndarray]
 
 
-def load(folder: str | os.PathLike[str], problem: Problem | None = None) -> Solution:
+def load(
+    cls: type[Solution], folder: str | os.PathLike[str], problem: Problem | None = None
+) -> Solution:
     """The solution in a folder; see `Solution.load`."""
     path = file_path(folder)
     summary, arrays = _read(path)
@@ -52,7 +58,7 @@ def load(folder: str | os.PathLike[str], problem: Problem | None = None) -> Solu
             problem = _stand_in(summary, arrays)
         else:
             _require_same(problem, summary, arrays)
-        solution = _solution(problem, summary, arrays)
+        solution = _solution(cls, problem, summary, arrays)
         _require_consistent(solution, summary)
         return solution
     except DraxError:
@@ -107,7 +113,9 @@ def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
         ) from error
 
 
-def _solution(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> Solution:
+def _solution(
+    cls: type[Solution], problem: Problem, summary: dict[str, Any], arrays: Arrays
+) -> Solution:
     multipliers = Multipliers(
         arrays["solution.multipliers.dynamics"],  # type: ignore[arg-type]
         _stagewise("solution.multipliers.constraints", arrays),
@@ -121,7 +129,7 @@ def _solution(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> Solu
         ),
     )
     history = {k.removeprefix("history_"): v for k, v in arrays.items() if k.startswith("history_")}
-    return Solution(
+    return cls(
         problem=problem,
         solver=from_data(summary["settings"]),
         seed=summary["seed"],
@@ -175,7 +183,7 @@ def _require_consistent(solution: Solution, summary: dict[str, Any]) -> None:
     require_whole("horizon of the saved solution", summary["horizon"])
     require_whole("seed of the saved solution", solution.seed, 0)
     require_positive("dt of the saved solution", float(dynamics.dt))
-    if not isinstance(solution.solver, Langevin | Restarts):
+    if not isinstance(solution.solver, Restarts):
         raise DraxError(
             f"the saved solution is damaged: its solver is {shown(solution.solver)}. Solve again."
         )
@@ -231,8 +239,9 @@ def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
         x_init=x_init,
         bounds=_box("problem.bounds", arrays),
         scatter=_box("problem.scatter", arrays),
-        aside=Aside(_missing("the goal") if summary["has_goal"] else None, None, summary["task"]),
         horizon=summary["horizon"],
+        goal=_missing("the goal") if summary["has_goal"] else None,
+        name=summary["task"],
     )
 
 
@@ -245,20 +254,21 @@ def _dynamics(summary: dict[str, Any], arrays: Arrays) -> Dynamics:
     if "model.binary" not in arrays:
         nx, nu = (arrays[f"solution.trajectories.{z}"].shape[-1] for z in "xu")
         return FunctionDynamics(_missing("f"), dt, nx, nu)
-    host = _model(summary, arrays)
-    bounded = bounded_joints(host.model, np.asarray(arrays["problem.x_init"], float))
-    substeps = round(dt / host.model.opt.timestep)
-    return MjxDynamics(twin(host.model, summary["contacts"], bounded), dt, host, substeps)
+    mj_model, source = _model(summary, arrays)
+    bounded = bounded_joints(mj_model, np.asarray(arrays["problem.x_init"], float))
+    planned = put_model(mj_model, summary["contacts"], bounded)
+    substeps = round(dt / mj_model.opt.timestep)
+    return MjxDynamics(planned, dt, mj_model, substeps, origin=source)
 
 
-def _model(summary: dict[str, Any], arrays: Arrays) -> HostModel:
-    """The compiled model, from its MJCF if another version of MuJoCo compiled it."""
+def _model(summary: dict[str, Any], arrays: Arrays) -> tuple[mujoco.MjModel, Source | None]:
+    """The compiled model, from its MJCF if another version of MuJoCo compiled it, and its MJCF."""
     source, written = None, summary["versions"]["mujoco"]
     if "model.xml" in arrays:
         files = {k: v.tobytes() for k, v in _within("model.files/", arrays).items()}
         source = Source(str(arrays["model.xml"]), files)
     if written == mujoco.__version__:
-        return HostModel(from_binary(arrays["model.binary"].tobytes()), source)
+        return from_binary(arrays["model.binary"].tobytes()), source
     if source is None:
         raise DraxError(
             f"the model was saved by MuJoCo {written} without MJCF, which MuJoCo "
@@ -271,7 +281,7 @@ def _model(summary: dict[str, Any], arrays: Arrays) -> HostModel:
         DraxWarning,
         stacklevel=4,
     )
-    return HostModel(source.compiled(), source)
+    return source.compiled(), source
 
 
 def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> None:

@@ -39,12 +39,13 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import require_positive
-from mjx_drax.method.langevin import FEASIBLE
 from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.problem.problem import Trajectory
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.solution.replay import Certificate
 
 if TYPE_CHECKING:
-    from mjx_drax.solution.solution import Certificate, Solution
+    from mjx_drax.solution.solution import Solution
 
 TOLERANCE = 0.25
 """Motions are the same if they differ, in the root mean square, by less than a quarter of the
@@ -147,7 +148,7 @@ def _distances(dynamics: Dynamics, motions: Array, landmark: Array, scale: Array
 
 def _optimum(solution: Solution, members: np.ndarray) -> Optimum:
     """What is known of the chains of one optimum, cheapest first."""
-    from mjx_drax.solution.solution import Certificate
+    from mjx_drax.solution.replay import Certificate
 
     chain = int(members[0])
     open_loop, feedback = solution.open_loop, solution.feedback

@@ -19,10 +19,17 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_whole, shown
-from mjx_drax.method.langevin import FEASIBLE, Langevin
-from mjx_drax.problem.checks import require_functions
-from mjx_drax.problem.problem import Problem, Trajectory, checked, from_function, numbers
-from mjx_drax.search.restarts import Progress, Restarts, run
+from mjx_drax.base.numbers import numbers
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.problem.build import from_function
+from mjx_drax.problem.problem import Problem, checked
+from mjx_drax.problem.tracing import require_functions
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.devices import mesh_for
+from mjx_drax.search.engine import Progress, Search
+from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.search.restarts import Restarts, settled
 
 
 def from_program(
@@ -138,14 +145,19 @@ def minimize(
             )
         u = jnp.asarray(given)[..., None, :]
         knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
-    result = run(program, chains, seed, Restarts() if solver is None else solver, knots, progress)
-    info, rows = result.info, program.constraint.equalities
-    multipliers = np.asarray(result.state.multipliers.constraints.stage[:, 0])
+    require_functions(progress=progress)
+    settings = settled(program, chains, seed, solver)
+    mesh = mesh_for(chains)
+    found = Search(
+        Family.of_one(program), chains, seed, settings, mesh=mesh, guess=knots, progress=progress
+    ).run()
+    state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
+    multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
     return Minimum(
-        x=np.asarray(result.state.trajectory.u[:, 0]),
+        x=np.asarray(state.trajectory.u[:, 0]),
         equality=multipliers[:, :rows],
         inequality=multipliers[:, rows:],
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
-        died_at=np.asarray(result.state.died_at),
+        died_at=np.asarray(state.died_at),
     )

@@ -1,7 +1,7 @@
 """Result files: `result.json` for reading, `result.npz` for computing, both to load again.
 
 Functions are code and are not saved: a loaded solution has everything but costs, constraints, goal
-and, without an MJCF, dynamics (see `loading`).
+and, without an MJCF, dynamics (see `load`).
 """
 
 from __future__ import annotations
@@ -13,24 +13,27 @@ import os
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
+from mjx_drax.base.digests import versions
 from mjx_drax.base.errors import DraxError
-from mjx_drax.base.files import complete, file_path, require_room
-from mjx_drax.physics.mjcf import MjxDynamics
+from mjx_drax.base.files import complete, file_path, json_data, require_room, write_json
+from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.source import binary
-from mjx_drax.problem.problem import Problem, Trajectory
-from mjx_drax.search.checkpoint import versions
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.settings import to_data
 from mjx_drax.solution.optima import Optimum
-from mjx_drax.solution.solution import Solution
+
+if TYPE_CHECKING:
+    from mjx_drax.solution.solution import Solution
 
 SUMMARY, ARRAYS = "result.json", "result.npz"
 
-FORMAT = 1
+FORMAT = 2
 """Changes whenever files that were written before can no longer be loaded."""
 
 WHOLE = ("trajectories", "multipliers", "gains", "open_loop", "feedback")
@@ -46,8 +49,8 @@ OPTIMA = 32
 def summary(solution: Solution) -> dict[str, Any]:
     """What `result.json` holds: settings, the best chain's numbers, certificate, versions."""
     best, certificate = solution.best_chain, solution.certificate
-    status = solution.status
-    return {
+    status, dynamics = solution.status, solution.problem.dynamics
+    whole: dict[str, Any] = {
         "format": FORMAT,
         "task": solution.problem.name,
         "seed": solution.seed,
@@ -56,27 +59,29 @@ def summary(solution: Solution) -> dict[str, Any]:
         "horizon": solution.problem.horizon,
         "dt": float(solution.problem.dynamics.dt),
         "has_goal": solution.problem.goal is not None,
-        "contacts": getattr(solution.problem.dynamics, "contacts", None),
+        "contacts": dynamics.contacts if isinstance(dynamics, MjxDynamics) else None,
         "settings": to_data(solution.solver),
         "compile_time_s": solution.compile_time,
         "solve_time_s": solution.solve_time,
         "best_chain": best,
         "certified": solution.certified,
-        "cost": _number(solution.cost[best]),
-        "max_defect": _number(solution.max_defect[best]),
-        "max_bound_violation": _number(solution.max_violation[best]),
+        "cost": solution.cost[best],
+        "max_defect": solution.max_defect[best],
+        "max_bound_violation": solution.max_violation[best],
         "success_rate": solution.success_rate,
         "status": {name: status.count(name) for name in sorted(set(status))},
         "certificate": {
             "engine": certificate.engine,
-            "open_loop": _finite(certificate.open_loop),
-            "feedback": _finite(certificate.feedback),
+            "open_loop": certificate.open_loop,
+            "feedback": certificate.feedback,
         },
         "optima_found": len(solution.optima),
         "optima": [_answer(optimum) for optimum in solution.optima[:OPTIMA]],
         "versions": versions(),
         "device": jax.devices()[0].device_kind,
     }
+    data: dict[str, Any] = json_data(whole)
+    return data
 
 
 def arrays(solution: Solution) -> dict[str, np.ndarray]:
@@ -129,12 +134,12 @@ def _answer(optimum: Optimum) -> dict[str, Any]:
     """One of the optima in `result.json`; share is of all chains."""
     return {
         "chain": optimum.chain,
-        "cost": _number(optimum.cost),
-        "max_defect": _number(optimum.max_defect),
+        "cost": optimum.cost,
+        "max_defect": optimum.max_defect,
         "members": len(optimum.members),
         "share": optimum.share,
-        "open_loop": _finite(optimum.certificate.open_loop),
-        "feedback": _finite(optimum.certificate.feedback),
+        "open_loop": optimum.certificate.open_loop,
+        "feedback": optimum.certificate.feedback,
     }
 
 
@@ -152,7 +157,7 @@ def _whole(solution: Solution) -> dict[str, np.ndarray]:
     if isinstance(dynamics, MjxDynamics):
         found["model.binary"] = np.frombuffer(binary(dynamics.mj_model), np.uint8)
         with contextlib.suppress(DraxError):  # without, only the same version can load it
-            source = dynamics.host.source()
+            source = dynamics.source()
             found["model.xml"] = np.array(source.xml)
             for name, content in source.assets.items():
                 found[f"model.files/{name}"] = np.frombuffer(content, np.uint8)
@@ -184,10 +189,8 @@ def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
     with complete(folder / ARRAYS) as partial:
         np.savez_compressed(partial, **arrays(solution))  # type: ignore[arg-type]
         digest = hashlib.sha256(partial.read_bytes()).hexdigest()
-    with complete(folder / SUMMARY) as partial:
-        whole = {**summary(solution), "npz_sha256": digest}
-        text = json.dumps({**whole, "json_sha256": json_digest(whole)}, indent=2)
-        partial.write_text(text + "\n", encoding="utf-8")
+    whole = {**summary(solution), "npz_sha256": digest}
+    write_json(folder / SUMMARY, {**whole, "json_sha256": json_digest(whole)})
     return folder
 
 
@@ -219,12 +222,3 @@ def expected_size(problem: Problem, chains: int) -> int:
     replays = 2 * knot * np.dtype(float).itemsize
     each = plan * problem.x_init.dtype.itemsize + replays
     return PICTURES + chains * problem.horizon * each
-
-
-def _number(value: Any) -> float | None:
-    """A float, or None (JSON has no NaN) where it is not finite."""
-    return float(value) if np.isfinite(value) else None
-
-
-def _finite(numbers: dict[str, Any]) -> dict[str, Any]:
-    return {k: v if isinstance(v, bool) else _number(v) for k, v in numbers.items()}

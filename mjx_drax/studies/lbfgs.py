@@ -13,6 +13,7 @@ lambda <- lambda + mu h. With noise, the noise is white (M = I).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,10 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from mjx_drax.base.pytrees import Static, register_dataclass
-from mjx_drax.method.metrics import Bounds, Direction, Identity, Levels, Multipliers, at_rest
-from mjx_drax.problem.problem import Problem, Trajectory
+from mjx_drax.method.metrics import Direction, Metric
+from mjx_drax.method.model import Model
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
 
 
 @register_dataclass
@@ -43,7 +46,7 @@ class Memory:
 
 @register_dataclass
 @dataclass(frozen=True)
-class LBFGS:
+class LBFGS(Metric):
     """Drift -M^{-1} grad L_mu with a limited-memory BFGS M.
 
     Attributes:
@@ -51,39 +54,34 @@ class LBFGS:
         inner: steps between two updates of the multipliers.
     """
 
-    multipliers_step_alone = True
-    ladder = Identity.ladder  # the line search's step size is for the knots only
+    full_multiplier_steps: ClassVar = True  # the line search's step size is for the knots only
 
     pairs: int = field(default=10, metadata=Static)
     inner: int = field(default=20, metadata=Static)
 
     def memory(self, problem: Problem, trajectory: Trajectory) -> Memory:
         """No pairs yet."""
-        zero = ravel_pytree(at_rest(problem, trajectory))[0]
+        zero = ravel_pytree(problem.no_change(trajectory))[0]
         pairs, none = jnp.zeros((self.pairs, zero.shape[0])), jnp.zeros(self.pairs)
         return Memory(pairs, pairs, none, trajectory, zero, jnp.zeros((), jnp.int32))
 
     def direction(
-        self,
-        problem: Problem,
-        bounds: Bounds,
-        trajectory: Trajectory,
-        multipliers: Multipliers,
-        levels: Levels,
-        key: Array,
-        memory: Memory,
+        self, problem: Problem, model: Model, noisy: Array | bool, key: Array, memory: Any
     ) -> Direction:
         """The quasi-Newton step; multipliers move in every `inner`-th step only."""
-        steepest = Identity().direction(problem, bounds, trajectory, multipliers, levels, key)
-        downhill, back = ravel_pytree(steepest.drift)
-        gradient = -downhill
-        memory = self._remember(problem, memory, trajectory, gradient)
+        steepest = super().direction(problem, model, noisy, key, memory)
+        gradient, back = ravel_pytree(model.gradient)
+        memory = self._remember(problem, memory, model.trajectory, gradient)
         drift = back(-_inverse_times(memory, gradient))
         update = memory.count == self.inner
         rate = jax.tree.map(lambda r: jnp.where(update, 0.5 * r, 0.0), steepest.multipliers)
-        count = jnp.where(update, 0, memory.count)
-        memory = Memory(memory.s, memory.y, memory.curvature, trajectory, gradient, count)
-        return Direction(drift, steepest.noise, rate, steepest.gains, memory)
+        memory = replace(
+            memory,
+            point=model.trajectory,
+            gradient=gradient,
+            count=jnp.where(update, 0, memory.count),
+        )
+        return replace(steepest, drift=drift, multipliers=rate, memory=memory)
 
     def _remember(
         self, problem: Problem, memory: Memory, trajectory: Trajectory, gradient: Array

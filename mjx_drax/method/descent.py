@@ -1,0 +1,145 @@
+"""The noise-free tail: a line search on L_mu, damping that adapts, multipliers of the bounds.
+
+With Gauss-Newton this is sequential quadratic programming, and it is what brings max|h| to rounding
+level. The step size is the one that lowers L_mu most, from a short geometric ladder evaluated in one
+batch. Each chain adapts its damping as Levenberg and Marquardt do, less after a full step and more
+after a short one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.bounds import Bounds
+from mjx_drax.method.model import Multipliers, augmented_lagrangian
+from mjx_drax.method.schedules import Weights
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory, Values
+
+LESS_DAMPING, MORE_DAMPING, SHORT_STEP = 1 / 3, 4.0, 0.2
+"""Factors on a chain's damping after a full step, and after one shorter than `SHORT_STEP`."""
+
+DAMPING_RANGE = 1e-3, 1e3
+"""Range of a chain's factor on the damping."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Info:
+    """Diagnostics of a chain: cost, max|h| and bound violation, scalars.
+
+    h holds the dynamics' defects and all constraints; inequalities count where positive.
+    """
+
+    cost: Array
+    max_defect: Array
+    max_violation: Array
+
+
+def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
+    """The diagnostics of a trajectory whose functions have these values."""
+    return Info(values.cost, problem.worst(values), problem.bounds.violation(trajectory))
+
+
+def line_search(
+    problem: Problem,
+    bounds: Bounds,
+    old: Trajectory,
+    multipliers: Multipliers,
+    weights: Weights,
+    drift: Trajectory,
+    ladder: tuple[float, ...],
+) -> tuple[Trajectory, Array, Info]:
+    """X + alpha d, alpha and diagnostics, for the alpha of the ladder with the least L_mu.
+
+    The ladder's last size is 0: if nothing is lower and finite, the chain stands still.
+    """
+
+    def candidate(alpha: Array) -> tuple[Array, tuple[Trajectory, Array, Info]]:
+        step = jax.tree.map(lambda d: alpha * d, drift)
+        new = bounds.confine(problem.bounds, old, problem.displaced(old, step))
+        values = problem.values(new)
+        merit = augmented_lagrangian(problem, bounds, new, multipliers, weights, values)
+        return merit, (new, alpha, diagnosed(problem, new, values))
+
+    sizes = jnp.asarray(ladder, old.x.dtype)
+    merits, candidates = jax.vmap(candidate)(sizes)
+    change = jnp.sum(merits - merits[-1], axis=1)
+    worst = jnp.finfo(change.dtype).max  # standing still is the best if nothing else is finite
+    change = jnp.where(sizes > 0.0, change, worst)
+    best = jnp.argmin(jnp.where(jnp.isfinite(change), change, jnp.inf))
+    chosen: Any = jax.tree.map(lambda z: z[best], candidates)
+    return chosen
+
+
+def metropolis(
+    problem: Problem,
+    bounds: Bounds,
+    old: Trajectory,
+    new: Trajectory,
+    multipliers: Multipliers,
+    weights: Weights,
+    alpha: ArrayLike,
+    drifts: tuple[Trajectory, Trajectory],
+    key: Array,
+) -> Trajectory:
+    """`new` or `old`, so that the density exp(-L_mu / sigma^2) is kept (Metropolis and Hastings).
+
+    The proposal is z' ~ N(z + alpha d(z), 2 alpha sigma^2 I), with d = `drifts` at the old and at
+    the new knots; what leaves the box is refused.
+    """
+    variance = 2.0 * jnp.asarray(alpha) * weights.noise**2
+
+    def merit(z: Trajectory) -> Array:
+        values = problem.values(z)
+        return augmented_lagrangian(problem, bounds, z, multipliers, weights, values)
+
+    def log_proposal(z: Trajectory, to: Trajectory, drift: Trajectory) -> Array:
+        off = jax.tree.map(lambda a, b, d: b - a - alpha * d, z, to, drift)
+        return -sum(jnp.sum(jnp.square(a)) for a in jax.tree.leaves(off)) / (2.0 * variance)
+
+    energy = jnp.sum(merit(new) - merit(old)) / weights.noise**2
+    log_ratio = -energy + log_proposal(new, old, drifts[1]) - log_proposal(old, new, drifts[0])
+    uniform = jax.random.uniform(jax.random.fold_in(key, 1))
+    accepted = (jnp.log(uniform) < log_ratio) & (problem.bounds.violation(new) == 0.0)
+    return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
+
+
+def adapted_damping(damping: Array, size: ArrayLike) -> Array:
+    """A chain's factor on the damping after a step of relative size alpha."""
+    short = jnp.where(jnp.asarray(size) < SHORT_STEP, MORE_DAMPING, 1.0)
+    factor = jnp.where(jnp.asarray(size) >= 1.0, LESS_DAMPING, short)
+    return jnp.clip(factor * damping, *DAMPING_RANGE)
+
+
+def adapted(
+    problem: Problem,
+    bounds: Bounds,
+    old: Any,
+    new: Any,
+    size: Array,
+    weights: Weights,
+    noisy: Array,
+) -> Any:
+    """A chain's new State with the damping and bounds' multipliers that an iteration leaves.
+
+    The multipliers of bounds take Newton's step in the tail, and are central while noise is on.
+    """
+    box, knots, v = problem.bounds, (old.trajectory, new.trajectory), old.multipliers.bounds
+    followed = bounds.follow(box, *knots, v, weights.barrier, size)
+    central = bounds.multipliers(box, new.trajectory, weights.barrier)
+    v = jax.tree.map(lambda a, b: jnp.where(noisy, a, b), central, followed)
+    damping = jnp.where(noisy, old.damping, adapted_damping(old.damping, size))
+    return replace(new, multipliers=replace(new.multipliers, bounds=v), damping=damping)
+
+
+def with_damping(weights: Weights, factor: Array) -> Weights:
+    """The weights with a chain's own damping."""
+    return replace(weights, damping=factor * weights.damping)

@@ -1,0 +1,192 @@
+"""The Gauss-Newton metric, M = H + mu J'J + delta D, by one block-tridiagonal factorization.
+
+H is the semidefinite model of the cost's Hessian plus the barrier's diagonal. Ordered by stage
+(u_k, x_{k+1}), M is block-tridiagonal, and `riccati` factorizes it. Before, the constraints of each
+stage join its cost, their slack variables eliminated:
+
+At one knot let r = [equality; inequality + s] with Jacobian J = [E; G] in the knot's displacement
+dz, multipliers nu, and a barrier on s with slope b and curvature c (damping included). The model
+
+    nu'(r + J dz + [0; ds]) + mu/2 |r + J dz + [0; ds]|^2 + b'ds + 1/2 ds'diag(c) ds
+
+is minimized over ds by ds = -(b + nu_g + mu r_g + mu G dz) / D with D = mu + c, elementwise. What
+is left for dz has gradient J'(nu + mu r) - G'(mu / D) t, where t = b + nu_g + mu r_g, and Hessian
+J'W J, W = mu for equalities and mu c / D for inequalities: an inequality weighs in as its slack
+nears zero. Given dz, ds has variance 1/D under N(0, M^{-1}).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.kernels.linalg import transposed_product
+from mjx_drax.method.metrics import Direction, Metric, drawn
+from mjx_drax.method.model import Derivatives, Model, Multipliers, QuadraticCost
+from mjx_drax.method.riccati import White, newton
+from mjx_drax.problem.differentiators import Autodiff, Differentiator
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class GaussNewton(Metric):
+    """M = H + mu J'J + delta D. The multipliers follow the predicted, noise-free residual.
+
+    r = mu (h + J d), with d = -M^{-1} grad L_mu.
+
+    The ladder is short, because damping adapts: with ten sizes no more chains succeed, and the tail
+    takes longer.
+
+    Attributes:
+        derivatives: of everything at a knot.
+        state_damping: D of states, where that of controls is 1; None: as the dynamics say, 1 for
+            smooth ones and 0.001 where contacts, limits or dry friction act.
+    """
+
+    ladder: ClassVar = (1.0, 1 / 2, 1 / 4, 1 / 16, 0.0)
+    has_gains: ClassVar = True
+    derivatives: Differentiator = field(default_factory=Autodiff)
+    state_damping: ArrayLike | None = None
+
+    def direction(
+        self, problem: Problem, model: Model, noisy: Array | bool, key: Array, memory: Any
+    ) -> Direction:
+        """Drift, noise and multiplier rate, from one factorization; with feedback gains."""
+        derivatives, weights, multipliers = model.derivatives, model.weights, model.multipliers
+        assert derivatives is not None  # for the type checker
+        of_states = model.state_damping if self.state_damping is None else self.state_damping
+        cost = _with_barrier(derivatives.cost, *model.barrier, weights.damping, of_states)
+        cost, stages, end = _with_constraints(cost, derivatives, model)
+        whites = _white(problem, stages, end, key)
+        white, slack_white = drawn(noisy, whites, jax.eval_shape(whites))
+        step = newton(derivatives.dynamics, cost, multipliers.dynamics, weights.penalty, white)
+
+        def back(block: Eliminated, dz: Array, nz: Array, xi: Array) -> Any:
+            return recover(block, dz, nz, xi, weights.penalty)
+
+        dz, nz = _stage_steps(step.dx, step.du), _stage_steps(step.nx, step.nu)
+        ds, ns, rate = jax.vmap(back)(stages, dz, nz, slack_white[0])
+        ds_end, ns_end, rate_end = back(end, step.dx[-1], step.nx[-1], slack_white[1])
+        has_slack = model.gradient.slack is not None
+        return Direction(
+            Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if has_slack else None),
+            Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if has_slack else None),
+            Multipliers(step.rate, Stagewise(rate, rate_end)),
+            step.K,
+            memory,
+        )
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Eliminated:
+    """What `recover` needs of one knot: J (m, n), r (m,), t (mg,) and D (mg,)."""
+
+    J: Array
+    r: Array
+    t: Array
+    D: Array
+
+
+def eliminate(
+    J: Array, r: Array, multipliers: Array, slope: Array, curvature: Array, penalty: Array
+) -> tuple[Array, Array, Eliminated]:
+    """Gradient (n,) and Hessian (n, n) of one knot's constraints, slacks (mg,) eliminated."""
+    equalities = r.shape[0] - slope.shape[0]
+    force = multipliers + penalty * r
+    D = penalty + curvature
+    t = slope + force[equalities:]
+    G = J[equalities:]
+    weights = jnp.concatenate([jnp.full(equalities, 1.0) * penalty, penalty * curvature / D])
+    gradient = transposed_product(J, force) - transposed_product(G, penalty * t / D)
+    return gradient, transposed_product(J, weights[:, None] * J), Eliminated(J, r, t, D)
+
+
+def recover(
+    block: Eliminated, dz: Array, nz: Array, white: Array, penalty: Array
+) -> tuple[Array, Array, Array]:
+    """Slack step ds (mg,), slack noise (mg,) and mu (r + J d) (m,), given dz and nz (n,)."""
+    equalities = block.r.shape[0] - block.t.shape[0]
+    G = block.J[equalities:]
+    ds = -(block.t + penalty * (G @ dz)) / block.D
+    ns = -penalty * (G @ nz) / block.D + white / jnp.sqrt(block.D)
+    return ds, ns, penalty * (block.r + block.J @ dz).at[equalities:].add(ds)
+
+
+def _with_barrier(
+    cost: QuadraticCost,
+    slope: Trajectory,
+    curvature: Trajectory,
+    damping: Array,
+    of_states: ArrayLike,
+) -> QuadraticCost:
+    """The model of c + rho b + delta/2 (|du|^2 + of_states |dx|^2); x_0 is fixed: no barrier."""
+    diagonal_x = jnp.full_like(cost.gx, of_states * damping).at[1:].add(curvature.x)
+    diagonal_u = damping + curvature.u
+    return QuadraticCost(
+        cost.gx.at[1:].add(slope.x),
+        cost.gu + slope.u,
+        cost.Hxx + jax.vmap(jnp.diag)(diagonal_x),
+        cost.Hux,
+        cost.Huu + jax.vmap(jnp.diag)(diagonal_u),
+    )
+
+
+def _with_constraints(
+    cost: QuadraticCost, derivatives: Derivatives, model: Model
+) -> tuple[QuadraticCost, Eliminated, Eliminated]:
+    """The cost with the constraints of every stage, and what their slacks are recovered from."""
+    K, ndx = derivatives.dynamics.h.shape
+    none = Stagewise(jnp.zeros((K, 0)), jnp.zeros(0))
+    slope, curvature = (of_barrier.slack or none for of_barrier in model.barrier)
+    weights, r, nu = model.weights, model.h.constraints, model.multipliers.constraints
+
+    def reduce(J: Array, r: Array, nu: Array, b: Array, c: Array) -> Any:
+        return eliminate(J, r, nu, b, c + weights.damping, weights.penalty)
+
+    g, H, stages = jax.vmap(reduce)(
+        derivatives.stage, r.stage, nu.stage, slope.stage, curvature.stage
+    )
+    g_end, H_end, end = reduce(
+        derivatives.terminal, r.terminal, nu.terminal, slope.terminal, curvature.terminal
+    )
+    with_constraints = QuadraticCost(
+        cost.gx + jnp.concatenate([g[:, :ndx], g_end[None]]),
+        cost.gu + g[:, ndx:],
+        cost.Hxx + jnp.concatenate([H[:, :ndx, :ndx], H_end[None]]),
+        cost.Hux + H[:, ndx:, :ndx],
+        cost.Huu + H[:, ndx:, ndx:],
+    )
+    return with_constraints, stages, end
+
+
+def _white(problem: Problem, stages: Eliminated, end: Eliminated, key: Array) -> Any:
+    """A function that draws standard normal numbers for controls, defects and slacks."""
+    K, dynamics = problem.horizon, problem.dynamics
+
+    def draw() -> tuple[White, tuple[Array, Array]]:
+        _, key_noise, key_slack = jax.random.split(key, 3)
+        key_u, key_e = jax.random.split(key_noise)
+        return White(
+            jax.random.normal(key_u, (K, dynamics.nu)),
+            jax.random.normal(key_e, (K, dynamics.ndx)),
+        ), (
+            jax.random.normal(key_slack, stages.D.shape),
+            jax.random.normal(jax.random.fold_in(key_slack, 1), end.D.shape),
+        )
+
+    return draw
+
+
+def _stage_steps(dx: Array, du: Array) -> Array:
+    """(dx_k, du_k) for k = 0..K-1, (K, ndx + nu), from steps of x_1..x_K; dx_0 = 0."""
+    before = jnp.concatenate([jnp.zeros_like(dx[:1]), dx[:-1]])
+    return jnp.concatenate([before, du], axis=1)

@@ -1,0 +1,256 @@
+"""The augmented Lagrangian at an iterate, its gradient, and its quadratic model.
+
+    L_mu(X, lambda) = c(X) + rho b(X) + lambda'h(X) + mu/2 |h(X)|^2
+
+X holds the knots x_1..x_K, u_0..u_{K-1} and slack variables s of inequalities. h holds the defects
+f(x_k, u_k) - x_{k+1} of the dynamics, the equality constraints, and g + s for inequalities g <= 0.
+b is the barrier of the bounds. Around knots that need not be feasible,
+
+    h_k(dz) ~ h_k + A_k dx_k + B_k du_k - dx_{k+1},     A = df/dx (ndx, ndx),  B = df/du (ndx, nu)
+
+and costs have a positive semidefinite model of their Hessian (Gauss-Newton).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.schedules import Weights
+from mjx_drax.problem.differentiators import Differentiator
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Stagewise, Trajectory, Values
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Multipliers:
+    """lambda of the dynamics (K, ndx) and of the constraints; v of the bounds, where followed."""
+
+    dynamics: Array
+    constraints: Stagewise
+    bounds: tuple[Trajectory, Trajectory] | None = None
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Linearization:
+    """A (K, ndx, ndx), B (K, ndx, nu) and the defects h (K, ndx), all in tangent space."""
+
+    A: Array
+    B: Array
+    h: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class QuadraticCost:
+    """Second-order model of the cost at x_0..x_K and u_0..u_{K-1}; all Hessians semidefinite.
+
+    gx (K+1, ndx), gu (K, nu), Hxx (K+1, ndx, ndx), Hux (K, nu, ndx), Huu (K, nu, nu).
+    """
+
+    gx: Array
+    gu: Array
+    Hxx: Array
+    Hux: Array
+    Huu: Array
+
+
+class Derivatives(NamedTuple):
+    """At every knot: of the dynamics, the costs, and the constraints.
+
+    Attributes:
+        dynamics: A, B and h.
+        cost: gradients, and semidefinite Hessians.
+        stage: Jacobian of the constraints in (dx, du), (K, m, ndx + nu).
+        terminal: Jacobian of the terminal constraints in dx, (m_end, ndx).
+    """
+
+    dynamics: Linearization
+    cost: QuadraticCost
+    stage: Array
+    terminal: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Model:
+    """What a metric may know of an iterate.
+
+    Attributes:
+        trajectory: the knots.
+        gradient: of L_mu, in tangent space, shaped like the knots.
+        h: defects (K, ndx) and constraints [equality; inequality + slack].
+        multipliers: lambda, and those of bounds.
+        weights: sigma, mu, delta, rho.
+        barrier: gradient and diagonal curvature of rho b, shaped like the knots.
+        state_damping: damping of states beside that of controls.
+
+        derivatives: of dynamics, costs and constraints at every knot; None where the metric asked
+            for none.
+    """
+
+    trajectory: Trajectory
+    gradient: Trajectory
+    h: Multipliers
+    multipliers: Multipliers
+    weights: Weights
+    barrier: tuple[Trajectory, Trajectory]
+    state_damping: float
+    derivatives: Derivatives | None = None
+
+
+def expand(
+    problem: Problem,
+    bounds: Any,
+    trajectory: Trajectory,
+    multipliers: Multipliers,
+    weights: Weights,
+    by: Differentiator | None,
+    key: Array,
+) -> Model:
+    """The model at a trajectory: every function differentiated by `by`, knot by knot.
+
+    Without `by` only the gradient is made, by one reverse-mode derivative of L_mu.
+    """
+    box, damping = problem.bounds, problem.dynamics.state_damping
+    slope, curvature = bounds.derivatives(box, trajectory, weights.barrier, multipliers.bounds)
+    tangent = problem.dynamics.tangent
+    barrier = replace(slope, x=tangent(slope.x)), replace(curvature, x=tangent(curvature.x))
+    if by is None:
+
+        def merit(change: Trajectory) -> Array:
+            moved = problem.displaced(trajectory, change)
+            return jnp.sum(penalized(problem, moved, problem.values(moved), multipliers, weights))
+
+        slope = jax.tree.map(jnp.add, jax.grad(merit)(problem.no_change(trajectory)), barrier[0])
+        constraints = problem.with_slack(problem.constraints(trajectory), trajectory.slack)
+        h = Multipliers(problem.defects(trajectory), constraints)
+        return Model(trajectory, slope, h, multipliers, weights, barrier, damping)
+
+    keys = jax.random.split(key, problem.horizon + 1)
+    dynamics = linearize(problem, trajectory, by, keys[:-1])
+    cost, stage, terminal, values = _expand_costs(problem, trajectory, by, keys)
+    h = Multipliers(dynamics.h, problem.with_slack(values, trajectory.slack))
+    derivatives = Derivatives(dynamics, cost, stage, terminal)
+    slope = _gradient(trajectory, multipliers, weights, derivatives, h)
+    slope = jax.tree.map(jnp.add, slope, barrier[0])
+    return Model(trajectory, slope, h, multipliers, weights, barrier, damping, derivatives)
+
+
+def linearize(
+    problem: Problem, trajectory: Trajectory, by: Differentiator, keys: Array
+) -> Linearization:
+    """A, B and h at every knot, with one random key for each, (K,)."""
+    dynamics = problem.dynamics
+    ndx, by = dynamics.ndx, dynamics.step_differentiator(by)
+
+    def stage(x: Array, u: Array, x_next: Array, key: Array) -> Linearization:
+        def defect(dz: Array) -> Array:
+            moved = dynamics.integrate(x, dz[:ndx])
+            return dynamics.difference(dynamics.step(moved, u + dz[ndx:]), x_next)
+
+        jacobian, h = by.jacobian(defect, ndx + dynamics.nu, key)
+        return Linearization(jacobian[:, :ndx], jacobian[:, ndx:], h)
+
+    return jax.vmap(stage)(problem.stages(trajectory), trajectory.u, trajectory.x, keys)
+
+
+def _expand_costs(
+    problem: Problem, trajectory: Trajectory, by: Differentiator, keys: Array
+) -> tuple[QuadraticCost, Array, Array, Stagewise]:
+    """The costs' model, the constraints' Jacobians and their values, at every knot."""
+    dynamics = problem.dynamics
+    ndx, nu, by = dynamics.ndx, dynamics.nu, dynamics.differentiator(by)
+
+    def stage(x: Array, u: Array, key: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        def at(dz: Array) -> tuple[Any, Array]:
+            moved = u + dz[ndx:]
+            return dynamics.observe(dynamics.integrate(x, dz[:ndx]), moved), moved
+
+        return problem.running.expand(at, ndx + nu, by, key), by.jacobian(
+            lambda dz: problem.constraint(*at(dz)), ndx + nu, key
+        )
+
+    def end(dx: Array) -> tuple[Any]:
+        moved = dynamics.integrate(trajectory.x[-1], dx)
+        return (dynamics.observe(moved, jnp.zeros(nu)),)
+
+    (g, H), (J, values) = jax.vmap(stage)(problem.stages(trajectory), trajectory.u, keys[:-1])
+    g_end, H_end = problem.terminal.expand(end, ndx, by, keys[-1])
+    J_end, values_end = by.jacobian(lambda dx: problem.terminal_constraint(*end(dx)), ndx, keys[-1])
+    cost = QuadraticCost(
+        jnp.concatenate([g[:, :ndx], g_end[None]]),
+        g[:, ndx:],
+        jnp.concatenate([H[:, :ndx, :ndx], H_end[None]]),
+        H[:, ndx:, :ndx],
+        H[:, ndx:, ndx:],
+    )
+    return cost, J, J_end, Stagewise(values, values_end)
+
+
+def _gradient(
+    trajectory: Trajectory,
+    multipliers: Multipliers,
+    weights: Weights,
+    derivatives: Derivatives,
+    h: Multipliers,
+) -> Trajectory:
+    """grad c + J'(lambda + mu h), knot by knot."""
+    dynamics, cost, stage, terminal = derivatives
+    ndx = dynamics.h.shape[-1]
+    present = replace(multipliers, bounds=None)
+    force = jax.tree.map(lambda m, r: m + weights.penalty * r, present, h)  # lambda + mu h
+    of_stage = jnp.einsum("kij,ki->kj", stage, force.constraints.stage)
+    gx = cost.gx.at[:-1].add(of_stage[:, :ndx])
+    gx = gx.at[-1].add(terminal.T @ force.constraints.terminal)
+    gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", dynamics.A, force.dynamics))
+    gu = cost.gu + of_stage[:, ndx:]
+    gu = gu + jnp.einsum("kij,ki->kj", dynamics.B, force.dynamics)
+    slack = None
+    if trajectory.slack is not None:  # h = g + s: the rows of inequalities, the last ones
+        rows, sizes = force.constraints, trajectory.slack
+        slack = jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], sizes, rows)
+    return Trajectory(gx[1:] - force.dynamics, gu, slack)
+
+
+def augmented_lagrangian(
+    problem: Problem,
+    bounds: Any,
+    trajectory: Trajectory,
+    multipliers: Multipliers,
+    weights: Weights,
+    values: Values,
+) -> Array:
+    """L_mu as one term per stage, (K + 1,), for a trajectory and the functions' values there.
+
+    Two trajectories are compared by summing the differences of their terms, which keeps far more
+    digits in float32 than the difference of their sums.
+    """
+    barrier = weights.barrier * bounds.value(problem.bounds, trajectory)
+    return jnp.append(barrier, 0.0) + penalized(problem, trajectory, values, multipliers, weights)
+
+
+def penalized(
+    problem: Problem,
+    trajectory: Trajectory,
+    values: Values,
+    multipliers: Multipliers,
+    weights: Weights,
+) -> Array:
+    """c + lambda'h + mu/2 |h|^2 as one term per stage, (K + 1,)."""
+
+    def penalty(multiplier: Array, h: Array) -> Array:
+        return jnp.sum(multiplier * h + 0.5 * weights.penalty * jnp.square(h), axis=-1)
+
+    h = problem.with_slack(values.constraints, trajectory.slack)
+    running = values.costs[:-1] + penalty(multipliers.dynamics, values.defects)
+    running = running + penalty(multipliers.constraints.stage, h.stage)
+    terminal = values.costs[-1] + penalty(multipliers.constraints.terminal, h.terminal)
+    return jnp.append(running, terminal)

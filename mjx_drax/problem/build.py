@@ -1,0 +1,261 @@
+"""Problems from functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpy.typing import ArrayLike
+
+from mjx_drax.base.errors import DraxError, require_positive, require_whole, shown
+from mjx_drax.base.numbers import vector
+from mjx_drax.problem.cost import Constraint, as_partial, constraint_of, cost_of
+from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
+from mjx_drax.problem.problem import Problem, checked
+from mjx_drax.problem.tracing import require_functions
+from mjx_drax.problem.trajectory import Box, Trajectory, box
+
+MOST = 1_000_000
+"""Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
+
+
+def knots(horizon: float, dt: float) -> int:
+    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
+
+    Raises:
+        DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
+    """
+    for label, value in (("dt", dt), ("horizon", horizon)):
+        require_positive(label, value, "a positive number of seconds")
+    share = float(horizon) / float(dt)
+    if share <= 0.5:
+        raise DraxError(
+            f"horizon is {horizon} s, shorter than one control step: give at least {dt:g} s."
+        )
+    if share >= MOST:
+        raise DraxError(
+            f"horizon is {horizon} s, which is {share:.3g} control steps of {dt:g} s: give less "
+            f"than {MOST:,} steps."
+        )
+    return round(share)
+
+
+def constraints_of(
+    dynamics: Dynamics,
+    equality: Callable[..., Any] | None,
+    inequality: Callable[..., Any] | None,
+    terminal_equality: Callable[..., Any] | None,
+    terminal_inequality: Callable[..., Any] | None,
+) -> tuple[Constraint, Constraint]:
+    """The constraints of the stages and of the end."""
+    x, u = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu)
+    seen = jax.eval_shape(dynamics.observe, x, u)
+    return (
+        constraint_of(equality, inequality, (seen, u)),
+        constraint_of(terminal_equality, terminal_inequality, (seen,), "terminal_"),
+    )
+
+
+def from_function(
+    f: Callable[[Array, Array], Array] | Dynamics,
+    *,
+    x_init: ArrayLike,
+    nu: int,
+    dt: float,
+    horizon: float,
+    running_cost: Callable[..., Any] | None = None,
+    terminal_cost: Callable[..., Any] | None = None,
+    running_residual: Callable[..., Any] | None = None,
+    terminal_residual: Callable[..., Any] | None = None,
+    equality: Callable[..., Any] | None = None,
+    inequality: Callable[..., Any] | None = None,
+    terminal_equality: Callable[..., Any] | None = None,
+    terminal_inequality: Callable[..., Any] | None = None,
+    x_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    goal: Callable[[Any], Any] | None = None,
+    guess: Callable[[Array], Trajectory] | None = None,
+    name: str = "problem",
+) -> Problem:
+    """A problem whose dynamics are a JAX function f(x (nx,), u (nu,)) -> x_next (nx,).
+
+    Args:
+        f: the dynamics. Parameters that should stay changeable without recompiling are bound with
+            `jax.tree_util.Partial`; the same holds for the costs.
+        x_init: x_0, (nx,).
+        nu: size of a control.
+        dt: control step [s].
+        horizon: duration [s]; K = horizon / dt knots, rounded.
+        running_cost: l(x, u), a scalar, summed over the knots as it stands.
+        terminal_cost: phi(x), a scalar.
+        running_residual: r(x, u) (n,): adds 1/2 |r|^2 to the running cost.
+        terminal_residual: r(x) (n,): adds 1/2 |r|^2 to the terminal cost.
+        equality: c(x, u) (m,), held at 0 at every stage k = 0..K-1.
+        inequality: g(x, u) (m,), held <= 0 at every stage.
+        terminal_equality: c(x) (m,), held at 0 at x_K.
+        terminal_inequality: g(x) (m,), held <= 0 at x_K.
+        x_bounds: (lower, upper) on every x_k, k >= 1.
+        u_bounds: (lower, upper) on every u_k.
+        x_scatter: box from which initial states are drawn; by default the bounds, and within
+            +-1 of x_init where those are infinite.
+        u_scatter: the same for controls; within +-1 of 0 where the bounds are infinite.
+        goal: goal(x_K) -> bool, what a replay must reach.
+        guess: guess(key) -> Trajectory, instead of the scatter boxes.
+        name: used in files and tables.
+
+    Raises:
+        DraxError: sizes, bounds, functions or numbers that do not fit, named one by one; a function
+            that computes something else when it is traced again.
+    """
+    given = {
+        "running_cost": running_cost,
+        "terminal_cost": terminal_cost,
+        "running_residual": running_residual,
+        "terminal_residual": terminal_residual,
+        "equality": equality,
+        "inequality": inequality,
+        "terminal_equality": terminal_equality,
+        "terminal_inequality": terminal_inequality,
+    }
+    require_functions(**given, goal=goal, guess=guess)
+    if f is None:
+        raise DraxError("f is None: give the dynamics, a function f(x, u) -> x_next.")
+    require_whole("nu", nu)
+    if nu > MOST:
+        raise DraxError(f"nu is {nu}, the size of a control: give at most {MOST:,}.")
+    require_name(name)
+    K = knots(horizon, dt)
+    start = vector("x_init", x_init)
+    nx = start.shape[0]
+    bounds = box(nx, nu, x_bounds, u_bounds)
+    if isinstance(f, Dynamics):
+        dynamics = f
+    else:
+        require_functions(f=f)
+        dynamics = FunctionDynamics(as_partial(f), dt, nx, nu)
+    scatter = scatter_box(bounds, start, jnp.ones(nx), x_scatter, u_scatter)
+    near = 1.0 if dynamics.kinked or dynamics.nx != dynamics.ndx else 0.0
+    return assembled(
+        dynamics, given, start, bounds, scatter, K, near, goal=goal, guess=guess, name=name
+    )
+
+
+def from_dynamics(dynamics: Dynamics, *, x_init: ArrayLike, horizon: float, **rest: Any) -> Problem:
+    """A problem with dynamics of your own.
+
+    Args:
+        dynamics: an object of a class that inherits `Dynamics`.
+        x_init: x_0, (nx,).
+        horizon: duration [s].
+        rest: the costs, constraints, bounds and other arguments of `from_function`.
+
+    Raises:
+        DraxError: as `from_function`.
+    """
+    if not isinstance(dynamics, Dynamics):
+        raise DraxError(
+            f"dynamics is {shown(dynamics)}: give an object of a class that inherits "
+            "mjx_drax.Dynamics, or a function to mjx_drax.from_function."
+        )
+    if jax.tree_util.all_leaves([dynamics]):
+        raise DraxError(
+            f"{type(dynamics).__name__} is no pytree: decorate the class with "
+            "@mjx_drax.register_dataclass and @dataclass(frozen=True)."
+        )
+    return from_function(
+        dynamics, x_init=x_init, nu=dynamics.nu, dt=dynamics.dt, horizon=horizon, **rest
+    )
+
+
+def assembled(
+    dynamics: Dynamics,
+    given: dict[str, Callable[..., Any] | None],
+    x_init: Array,
+    bounds: Box,
+    scatter: Box,
+    horizon: int,
+    near: float,
+    **host: Any,
+) -> Problem:
+    """A problem from its parts, checked.
+
+    Args:
+        dynamics: f.
+        given: the user's costs, residuals and constraints, by the names of `from_function`.
+        x_init: x_0, (nx,).
+        bounds: of states and controls.
+        scatter: box for initial knots.
+        horizon: K.
+        near: share of chains that start nearer to x_init.
+        host: goal, guess and name.
+    """
+    constraint, terminal_constraint = constraints_of(
+        dynamics,
+        given["equality"],
+        given["inequality"],
+        given["terminal_equality"],
+        given["terminal_inequality"],
+    )
+    return checked(
+        Problem(
+            dynamics=dynamics,
+            running=cost_of(given["running_cost"], given["running_residual"]),
+            terminal=cost_of(given["terminal_cost"], given["terminal_residual"]),
+            constraint=constraint,
+            terminal_constraint=terminal_constraint,
+            x_init=x_init,
+            bounds=bounds,
+            scatter=scatter,
+            horizon=horizon,
+            near=near,
+            **host,
+        )
+    )
+
+
+def require_name(name: object) -> None:
+    """Complain about a name that is no text.
+
+    Raises:
+        DraxError: naming its value.
+    """
+    if not isinstance(name, str) or not name:
+        raise DraxError(f"name is {shown(name)}: give a text.")
+
+
+def scatter_box(
+    bounds: Box,
+    x_init: Array,
+    reach: Array,
+    x: tuple[ArrayLike, ArrayLike] | None,
+    u: tuple[ArrayLike, ArrayLike] | None,
+) -> Box:
+    """The box for initial knots: what is asked for, else the bounds, else x_init +- reach (nx,)."""
+    nx, nu = x_init.shape[0], bounds.u_lower.shape[-1]
+    given = box(nx, nu, x, u)
+
+    @jax.jit
+    def ends(
+        asked: tuple[Array, Array], bound: tuple[Array, Array], middle: Array, reach: Array
+    ) -> tuple[Array, Array]:
+        low, high = (jnp.where(jnp.isfinite(a), a, b) for a, b in zip(asked, bound, strict=True))
+        # Where an end is free: next to the other one, or about the middle if both are.
+        middle = jnp.clip(middle, low + reach, high - reach)
+        return (
+            jnp.where(jnp.isfinite(low), low, middle - reach),
+            jnp.where(jnp.isfinite(high), high, middle + reach),
+        )
+
+    x_ends = ends((given.x_lower, given.x_upper), (bounds.x_lower, bounds.x_upper), x_init, reach)
+    u_ends = ends(
+        (given.u_lower, given.u_upper),
+        (bounds.u_lower, bounds.u_upper),
+        jnp.zeros(nu),
+        jnp.ones(nu),
+    )
+    return Box(x_ends[0], x_ends[1], u_ends[0], u_ends[1])

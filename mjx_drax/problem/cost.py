@@ -1,0 +1,144 @@
+"""Costs and constraints of one knot, from the functions that a user gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import Partial
+
+from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.kernels.linalg import transposed_product
+from mjx_drax.problem.differentiators import Differentiator, positive_part
+from mjx_drax.problem.tracing import traced
+
+
+def as_partial(function: Callable[..., Any]) -> Partial:
+    """The function as a pytree: static code, traced arguments.
+
+    A `jax.tree_util.Partial` given by the user keeps its bound arguments as traced leaves, which
+    is how a cost or a model takes parameters that may change without recompiling. So does any other
+    callable that is registered as a pytree, like the terms of `mjx_drax.Terms`.
+    """
+    if isinstance(function, Partial):
+        return function
+    if not jax.tree_util.all_leaves([function]):
+        cls: Any = type(function)
+        return Partial(_call_of(cls), function)
+    return Partial(function)
+
+
+@lru_cache
+def _call_of(cls: type) -> Callable[..., Any]:
+    """What calls objects of one class: of two classes the structures may be equal, this is not."""
+
+    def call(function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments)
+
+    return call
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Cost:
+    """scalar(...) + 1/2 |residual(...)|^2, either part optional.
+
+    A residual is the better way to give a cost: its Gauss-Newton Hessian J'J is positive
+    semidefinite by construction and needs first derivatives only.
+    """
+
+    scalar: Partial | None
+    residual: Partial | None
+
+    def __call__(self, *arguments: Any) -> Array:
+        """The cost, a scalar."""
+        total = jnp.zeros(())
+        if self.scalar is not None:
+            total = total + self.scalar(*arguments)
+        if self.residual is not None:
+            total = total + 0.5 * jnp.sum(jnp.square(self.residual(*arguments)))
+        return total
+
+    def expand(
+        self, at: Callable[[Array], tuple[Any, ...]], size: int, by: Differentiator, key: Array
+    ) -> tuple[Array, Array]:
+        """Gradient (n,) and positive semidefinite Hessian (n, n) in local coordinates.
+
+        `at(dz)` gives the cost's arguments a displacement dz (n,) away from the knot. The residual
+        contributes J'r and J'J; the scalar its gradient, and its Hessian with negative eigenvalues
+        set to zero.
+        """
+        gradient, hessian = jnp.zeros(size), jnp.zeros((size, size))
+        if self.scalar is not None:
+            scalar = self.scalar
+
+            def value(dz: Array) -> Array:
+                return jnp.asarray(scalar(*at(dz)), float)  # also a plain number
+
+            slope, _ = by.jacobian(lambda dz: value(dz)[None], size, key)
+            gradient = gradient + slope[0]
+            hessian = hessian + positive_part(by.hessian(value, size))
+        if self.residual is not None:
+            residual = self.residual
+            jacobian, r = by.jacobian(lambda dz: jnp.ravel(residual(*at(dz))), size, key)
+            gradient = gradient + transposed_product(jacobian, r)
+            hessian = hessian + transposed_product(jacobian, jacobian)
+        return gradient, hessian
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Constraint:
+    """equality(...) = 0 and inequality(...) <= 0, either part optional; rows in that order."""
+
+    equality: Partial | None
+    inequality: Partial | None
+    equalities: int = field(metadata=Static)
+    inequalities: int = field(metadata=Static)
+
+    def __call__(self, *arguments: Any) -> Array:
+        """Both parts in one vector, (equalities + inequalities,)."""
+        parts = [p for p in (self.equality, self.inequality) if p is not None]
+        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
+
+    def with_slack(self, values: Array, slack: Array) -> Array:
+        """The equality constraints [equality; inequality + slack], for values (..., m)."""
+        inequality = values[..., self.equalities :] + slack
+        return jnp.concatenate([values[..., : self.equalities], inequality], axis=-1)
+
+    def violation(self, values: Array) -> Array:
+        """Largest |equality| or positive inequality, scalar; 0 without constraints."""
+        equality = jnp.abs(values[..., : self.equalities]).max(initial=0.0)
+        return jnp.maximum(equality, values[..., self.equalities :].max(initial=0.0))
+
+
+def cost_of(cost: Callable[..., Any] | None, residual: Callable[..., Any] | None) -> Cost:
+    """A Cost from the functions that a user gives; either or both may be None."""
+    return Cost(
+        None if cost is None else as_partial(cost),
+        None if residual is None else as_partial(residual),
+    )
+
+
+def constraint_of(
+    equality: Callable[..., Any] | None,
+    inequality: Callable[..., Any] | None,
+    arguments: tuple[Any, ...],
+    label: str = "",
+) -> Constraint:
+    """A Constraint from the functions that a user gives; their sizes are traced abstractly."""
+    sizes = []
+    for name, function in (("equality", equality), ("inequality", inequality)):
+        if function is None:
+            sizes.append(0)
+            continue
+        out = traced(f"{label}{name}", function, arguments)
+        sizes.append(int(np.prod(out.shape)))
+    parts = [None if f is None else as_partial(f) for f in (equality, inequality)]
+    return Constraint(parts[0], parts[1], sizes[0], sizes[1])

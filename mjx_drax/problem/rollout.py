@@ -1,0 +1,132 @@
+"""Replays in float64: states that follow from controls and feedback, and arithmetic of states.
+
+They work for any dynamics that JAX can trace, and know nothing of how a plan was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from functools import lru_cache, partial
+from types import CellType, CodeType, FunctionType, MethodType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+
+def replay(
+    dynamics: Any,
+    plan: np.ndarray,
+    u: np.ndarray,
+    gains: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Dynamics.replay`, by f."""
+    with jax.enable_x64(True):
+        step, difference, own = _in_float64(dynamics, "step", "difference")
+        ran = _replay(step, difference, own, *jax.tree.map(_double, (plan, u, gains, limits)))
+        return np.asarray(ran[0]), np.asarray(ran[1])
+
+
+def apply(dynamics: Any, name: str, *arrays: np.ndarray) -> np.ndarray:
+    """A method of the dynamics that works on single states, for arrays (..., n) of them."""
+    leading = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+    rows = [np.broadcast_to(a, (*leading, a.shape[-1])).reshape(-1, a.shape[-1]) for a in arrays]
+    with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        method, own = _in_float64(dynamics, name)
+        out = np.asarray(_apply(method, own, *map(_double, rows)))
+    return out.reshape(*leading, -1)
+
+
+def _in_float64(dynamics: Any, *names: str) -> tuple[Any, ...]:
+    """Methods of the dynamics as functions of it, and the dynamics, with numbers in float64."""
+    own = dynamics.in_float64()
+    methods = [untraced(getattr(type(own), name)) for name in names]
+    return *methods, jax.tree.map(_double, own)
+
+
+@partial(jax.jit, static_argnums=0)
+def _apply(method: Callable[..., Array], dynamics: Any, *rows: Array) -> Array:
+    return jax.vmap(partial(method, dynamics))(*rows)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _replay(
+    step: Callable[..., Array],
+    difference: Callable[..., Array],
+    dynamics: Any,
+    plan: Array,
+    u: Array,
+    gains: Array,
+    limits: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    lower, upper = (jnp.broadcast_to(side, u.shape[1:]) for side in limits)
+
+    def advance(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        planned, control, gain, low, high = stage
+        control = jnp.clip(control + gain @ difference(dynamics, x, planned), low, high)
+        x = step(dynamics, x, control)
+        return x, (x, control)
+
+    def chain(plan: Array, u: Array, gains: Array) -> tuple[Array, Array]:
+        states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, lower, upper))[1]
+        return jnp.concatenate([plan[:1], states]), applied
+
+    return jax.vmap(chain)(plan, u, gains)
+
+
+def _double(leaf: Any) -> Any:
+    """The same number or array in float64, if it is one of floats."""
+    array = np.asarray(leaf)
+    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else leaf
+
+
+@lru_cache
+def untraced(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function, with copies of the numpy arrays that it and its helpers refer to.
+
+    JAX knows an array by its identity, in the precision in which it first saw it, and a function
+    that was traced in float32 then fails in float64.
+    """
+    return _copied(function, {})
+
+
+def _copied(value: Any, seen: dict[int, Any]) -> Any:
+    """A copy of arrays, and of containers, methods and functions that hold them; else the same."""
+    if id(value) in seen:
+        return seen[id(value)]
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if type(value) in (list, tuple):
+        return type(value)(_copied(entry, seen) for entry in value)
+    if type(value) is dict:
+        return {key: _copied(entry, seen) for key, entry in value.items()}
+    if isinstance(value, MethodType):
+        owner = copy(value.__self__)
+        for name, entry in vars(value.__self__).items():
+            object.__setattr__(owner, name, _copied(entry, seen))
+        return MethodType(_copied(value.__func__, seen), owner)
+    if not isinstance(value, FunctionType):
+        return value
+    if (value.__module__ or "").split(".")[0] in ("jax", "numpy"):
+        return value
+    names = dict(value.__globals__)
+    cells = tuple(CellType() for _ in value.__closure__ or ())
+    new = FunctionType(value.__code__, names, value.__name__, value.__defaults__, cells)
+    new.__kwdefaults__ = value.__kwdefaults__
+    seen[id(value)] = new
+    for cell, old in zip(cells, value.__closure__ or (), strict=True):
+        cell.cell_contents = _copied(old.cell_contents, seen)
+    for name in _names(value.__code__):
+        if name in names:
+            names[name] = _copied(names[name], seen)
+    return new
+
+
+def _names(code: CodeType) -> set[str]:
+    """Names of globals that a function may use, those of functions inside it included."""
+    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
+    return set(code.co_names).union(*map(_names, inner))

@@ -1,0 +1,142 @@
+"""Knot points x_1..x_K, u_0..u_{K-1}, the box that they keep to, and what functions are there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.base.numbers import numbers
+from mjx_drax.base.pytrees import register_dataclass
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Stagewise:
+    """Numbers that go with constraints: for the stages (..., K, m) and for the end (..., m_end)."""
+
+    stage: Array
+    terminal: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
+    """Knot points: states x_1..x_K (..., K, nx) and controls u_0..u_{K-1} (..., K, nu).
+
+    What a chain carries also has the slack variables s >= 0 of inequalities; a trajectory that a
+    user gives does not.
+    """
+
+    x: Array
+    u: Array
+    slack: Stagewise | None = None
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Values:
+    """What the functions of a problem are at a trajectory.
+
+    Attributes:
+        costs: l(x_k, u_k) and phi(x_K), (K + 1,).
+        defects: h_k, (K, ndx).
+        constraints: [equality; inequality], without slack variables.
+    """
+
+    costs: Array
+    defects: Array
+    constraints: Stagewise
+
+    @property
+    def cost(self) -> Array:
+        """phi(x_K) + sum_k l(x_k, u_k), scalar."""
+        return jnp.sum(self.costs[:-1]) + self.costs[-1]
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Box:
+    """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free."""
+
+    x_lower: Array
+    x_upper: Array
+    u_lower: Array
+    u_upper: Array
+
+    def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
+        """The lower and the upper end for every knot of a trajectory, as two trajectories."""
+        x, u = trajectory.x, trajectory.u
+        zeros = jax.tree.map(jnp.zeros_like, trajectory.slack)
+        infinite = jax.tree.map(lambda s: jnp.full_like(s, jnp.inf), trajectory.slack)
+
+        def side(of_x: Array, of_u: Array, of_slack: Stagewise | None) -> Trajectory:
+            return Trajectory(
+                jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape), of_slack
+            )
+
+        lower = side(self.x_lower, self.u_lower, zeros)
+        upper = side(self.x_upper, self.u_upper, infinite)
+        return lower, upper
+
+    def violation(self, trajectory: Trajectory) -> Array:
+        """Largest distance by which any knot leaves the box, 0 if none does, scalar."""
+        lower, upper = self.sides(trajectory)
+        out = jax.tree.map(
+            lambda z, a, b: jnp.maximum((a - z).max(initial=0.0), (z - b).max(initial=0.0)),
+            trajectory,
+            lower,
+            upper,
+        )
+        return jnp.maximum(out.x, out.u)
+
+
+def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:
+    """(lower, upper) as given, or infinite for None."""
+    if ends is None:
+        return -np.inf, np.inf
+    try:
+        lower, upper = ends
+    except (TypeError, ValueError) as error:
+        raise DraxError(
+            f"bounds of {label} are {shown(ends)}: give a pair (lower, upper)."
+        ) from error
+    return lower, upper
+
+
+def box(
+    nx: int,
+    nu: int,
+    x: tuple[ArrayLike, ArrayLike] | None = None,
+    u: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Box:
+    """A box from (lower, upper) pairs, scalars or arrays that broadcast to (nx,) and (nu,).
+
+    A side that is None is free.
+    """
+
+    def end(value: ArrayLike, size: int, label: str) -> Array:
+        try:
+            array = numbers(value)
+            if np.isnan(array).any():
+                raise ValueError("NaN is no bound")
+            return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
+        except (TypeError, ValueError) as error:
+            raise DraxError(
+                f"{label} is {shown(value)}: give numbers of shape ({size},), or one for all; -inf "
+                "and inf leave it free."
+            ) from error
+
+    (xl, xu), (ul, uu) = _pair("x", x), _pair("u", u)
+    return Box(
+        end(xl, nx, "lower end of x"),
+        end(xu, nx, "upper end of x"),
+        end(ul, nu, "lower end of u"),
+        end(uu, nu, "upper end of u"),
+    )

@@ -1,0 +1,216 @@
+"""What stands at the door of a solve: whether settings and functions can work.
+
+Settings are looked at; functions are traced, and tried at the initial knots, with derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax.base.errors import DraxError, require_part, require_whole, shown
+from mjx_drax.base.numbers import numbers
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.method.metrics import Identity
+from mjx_drax.method.schedules import Scale
+from mjx_drax.problem.differentiators import Autodiff
+from mjx_drax.problem.problem import Problem, functions_of
+from mjx_drax.problem.tracing import require_derivatives
+from mjx_drax.problem.trajectory import Trajectory
+
+_POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
+
+
+def check_flow(flow: Langevin, problem: Problem) -> None:
+    """Complain about settings of a flow that cannot work.
+
+    Raises:
+        DraxError: naming the setting, its value and the fix.
+    """
+    for name in ("iterations", "tail"):
+        require_whole(name, getattr(flow, name), 0)
+    if flow.iterations + flow.tail < 1:
+        raise DraxError("iterations + tail is 0: give at least 1.")
+    for name in ("noise", "penalty", "damping", "barrier_weight"):
+        schedule = getattr(flow, name)
+        if not callable(schedule) or isinstance(schedule, type):
+            number = shown(schedule) if np.isscalar(schedule) else "0.1"
+            raise DraxError(f"{name} is {shown(schedule)}: give a schedule, Constant({number}).")
+    require_part("preconditioner", flow.preconditioner, "direction", "GaussNewton()")
+    require_part("bounds", flow.bounds, "confine", "LogBarrier()")
+    if flow.preconditioner.derivatives is not None:
+        by = flow.preconditioner.derivatives
+        require_part("preconditioner.derivatives", by, "jacobian", "Autodiff()")
+    _check_numbers(flow)
+    _check_adjusted(flow, problem)
+    _check_derivatives(flow, problem)
+
+
+def _check_numbers(part: Any, prefix: str = "") -> None:
+    """Complain about a setting that is no number, or one that makes no sense."""
+    for setting in fields(part):
+        value, name = getattr(part, setting.name), prefix + setting.name
+        if is_dataclass(value):
+            _check_numbers(value, f"{name}.")
+        elif setting.name in _COUNTS:
+            require_whole(name, value)
+        elif value is not None and not callable(value):
+            try:
+                number = numbers(value)
+            except (TypeError, ValueError):
+                number = np.array(np.nan)
+            positive = setting.name in _POSITIVE
+            good = number.shape == () and np.isfinite(number)
+            if not good or number < 0 or (positive and number == 0):
+                least = "greater than 0" if positive else "of at least 0"
+                raise DraxError(f"{name} is {shown(value)}: give a finite number {least}.")
+            if setting.name == "fraction" and number >= 1:
+                raise DraxError(f"{name} is {shown(value)}: give a share below 1, such as 0.9.")
+
+
+def _check_adjusted(flow: Langevin, problem: Problem) -> None:
+    constrained = problem.constraint.inequalities + problem.terminal_constraint.inequalities
+    if flow.adjusted and (constrained or not isinstance(flow.preconditioner, Identity)):
+        raise DraxError(
+            f"adjusted=True with {type(flow.preconditioner).__name__} and {constrained} "
+            "inequalities: Metropolis adjustment needs Identity() and no inequalities."
+        )
+    if flow.adjusted and problem.dynamics.nx != problem.dynamics.ndx:
+        raise DraxError(
+            f"adjusted=True, but states of {problem.name} hold quaternions: Metropolis "
+            "adjustment needs a vector space."
+        )
+
+
+def _in_reverse(flow: Langevin) -> bool:
+    """Whether the metric differentiates L_mu in reverse mode."""
+    return flow.preconditioner.derivatives is None
+
+
+def _exactly(flow: Langevin) -> bool:
+    """Whether functions are differentiated, not sampled."""
+    return _in_reverse(flow) or isinstance(flow.preconditioner.derivatives, Autodiff)
+
+
+def _in_forward(flow: Langevin, problem: Problem) -> bool:
+    """Whether a problem's functions are differentiated exactly, in forward mode.
+
+    Feedback gains are, after a flow in reverse mode too; a Metropolis step heeds values, so its
+    costs may have jumps.
+    """
+    gains = problem.dynamics.nx > 0
+    return _exactly(flow) and not flow.adjusted and (not _in_reverse(flow) or gains)
+
+
+def _check_derivatives(flow: Langevin, problem: Problem) -> None:
+    """Complain about functions of the problem that cannot be differentiated as they will be."""
+    if flow.adjusted or not _exactly(flow):
+        return
+    dynamics, forward, reverse = problem.dynamics, _in_forward(flow, problem), _in_reverse(flow)
+    for label, function, arguments, _ in functions_of(problem):
+        if function == dynamics.step and dynamics.checked:
+            continue
+        twice = forward and label.endswith("cost")
+        require_derivatives(label, function, arguments, forward, twice, reverse)
+
+
+def require_finite(
+    flow: Langevin, problem: Problem, knots: Trajectory, cost: Array, max_defect: Array
+) -> None:
+    """Complain if no chain could possibly start; cost and max|h| are (chains,)."""
+    for label, values in (("cost", cost), ("dynamics", max_defect)):
+        if not np.isfinite(values).any():
+            require_sound(flow, problem, knots)
+            raise DraxError(
+                f"the {label} of {problem.name} is {float(values[0])} at the initial knots of "
+                f"every chain ({len(values)} tried): make it finite there (no 0/0, no log or sqrt "
+                "of negative numbers), or narrow the scatter of the initial knots."
+            )
+
+
+def require_sound(flow: Langevin, problem: Problem, knots: Trajectory, with_f: bool = True) -> None:
+    """Complain about a function that is finite, with its derivatives, for no chain's knots.
+
+    Those of a stage are tried at x_init, where every chain stays, and its first control; those of
+    the end at its last state.
+
+    Raises:
+        DraxError: naming the function, where it fails and the fix.
+    """
+    flow = replace(flow, scale=Scale())  # of one type, measured or not
+    finite = _soundness(flow, problem, knots, _in_forward(flow, problem), with_f)
+    for label, *_ in functions_of(problem):
+        for what, good in zip(
+            ("value", "derivative", "second derivative"), finite.get(label, []), strict=False
+        ):
+            if not np.asarray(good).any():
+                at = "the initial points"
+                if problem.dynamics.nx:
+                    at = "the last initial state" if label.startswith("terminal") else "x_init"
+                raise DraxError(
+                    f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
+                    "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
+                    "move x_init or the scatter of initial knots."
+                )
+
+
+@partial(jax.jit, static_argnames=("exact", "with_f"))
+def _soundness(
+    flow: Langevin, problem: Problem, knots: Trajectory, exact: bool, with_f: bool
+) -> dict[str, list[Array]]:
+    """Whether functions, first and second derivatives are finite, (chains,) each.
+
+    Derivatives are taken in one direction that moves every number.
+    """
+    inside = jax.vmap(partial(flow.bounds.interior, problem.bounds))(replace(knots, slack=None))
+    u = inside.u[:, 0]
+    start = jnp.broadcast_to(problem.x_init, (len(u), problem.dynamics.nx))
+    found = {}
+    for label, function, arguments, _ in functions_of(problem):
+        if function == problem.dynamics.step and not with_f:
+            continue
+        at_end = len(arguments) == 1
+        z = jnp.concatenate([inside.x[:, -1] if at_end else start, u], axis=1)
+        order = (2 if label.endswith("cost") else 1) if exact else 0
+        orders = jax.vmap(_with_slopes(_of_knot(problem, function, at_end), order))(z)
+        found[label] = [jnp.isfinite(each).reshape(len(u), -1).all(axis=1) for each in orders]
+    return found
+
+
+def _of_knot(
+    problem: Problem, function: Callable[..., Any], at_end: bool
+) -> Callable[[Array], Array]:
+    """A function of a problem as one of z = [x, u]."""
+    dynamics = problem.dynamics
+
+    def value(z: Array) -> Array:
+        x, u = jnp.split(z, [dynamics.nx])
+        if function == dynamics.step:
+            return dynamics.step(x, u)
+        if at_end:
+            return jnp.asarray(function(dynamics.observe(x, jnp.zeros_like(u))), float)
+        return jnp.asarray(function(dynamics.observe(x, u), u), float)
+
+    return value
+
+
+def _with_slopes(
+    function: Callable[[Array], Array], order: int
+) -> Callable[[Array], tuple[Array, ...]]:
+    """The function and its derivatives along (1, ..., 1), up to an order."""
+    if order == 0:
+        return lambda z: (function(z),)
+    lower = _with_slopes(function, order - 1)
+
+    def slopes(z: Array) -> tuple[Array, ...]:
+        values, changes = jax.jvp(lower, (z,), (jnp.ones_like(z),))
+        return *values, changes[-1]
+
+    return slopes

@@ -1,0 +1,691 @@
+"""One search for one problem or for thousands: attempts, each in chunks of problems.
+
+An attempt draws initial knots for every chain of a chunk's problems, runs the flow, follows it with
+rollouts if the settings say so, and keeps the best of every chain. Each problem has its own scales,
+random numbers and attempts, so its answer does not depend on which others are solved beside it.
+`solve` and `minimize` have one problem and one chunk. `solve_batch` packs the problems that are not
+done into chunks of one size, which one compilation serves and which fit into memory.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh
+from jax.typing import ArrayLike
+
+from mjx_drax.base.digests import digest
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
+from mjx_drax.method.langevin import Langevin, State
+from mjx_drax.method.schedules import Scale
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.checkpoint import Checkpoint, facts
+from mjx_drax.search.checks import require_finite, require_sound
+from mjx_drax.search.devices import gathered, spread
+from mjx_drax.search.family import Family
+from mjx_drax.search.initial import initial_knots
+from mjx_drax.search.iterate import (
+    FEASIBLE,
+    Question,
+    begin,
+    iterate,
+    joined,
+    noise_at,
+    ranking,
+    restart_at,
+)
+from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
+from mjx_drax.search.restarts import Restarts, scale_of
+from mjx_drax.search.settings import to_data
+
+REPORT_EVERY = 20
+"""Iterations between two reports, records of the history, and chances to interrupt; a hundredth
+of an attempt's where that is more."""
+
+COST_SCALE = 1 / 300
+"""The scale of costs, as a share of the median cost of the initial knots."""
+
+STRICTER = 10.0
+"""Factor on the scale of costs after an attempt in which not one chain became feasible."""
+
+NEGLIGIBLE = 0.03
+"""Differences of cost below so many scales of costs do not count."""
+
+CHEAPER = 1e-3
+"""A rollout is an improvement if it is cheaper by more than this share."""
+
+Progress = Callable[[int, int, Info], None]
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Chains:
+    """Where chains are: one row each, and since which iteration each was feasible, or -1."""
+
+    state: State
+    info: Info
+    feasible_since: np.ndarray
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Of the knots, (rows,)."""
+        return np.asarray(self.info.cost)
+
+    @property
+    def feasible(self) -> np.ndarray:
+        """Whether max|h| < `FEASIBLE`, (rows,)."""
+        return np.asarray(self.info.max_defect) < FEASIBLE
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Stage:
+    """How far a search is: all that the rest of it depends on.
+
+    Attributes:
+        attempt: the one that is under way, from 0.
+        cost_scale: of each problem, (N,).
+        todo: problems of this attempt.
+        place: how many of them are done; the chunk is what follows.
+        begun: whether `now` belongs to this chunk; else it has not begun.
+        owners: for which of its problem's chains each row works, (rows,).
+        kept: the best so far of all chains of all problems, (N * chains,); None before any.
+        now: where the chunk's chains are, (rows,).
+        damping: of each row between rollouts, (rows,).
+        step: how many of the attempt's iterations are done.
+        rollouts: how many rollouts, and rounds of them, are done.
+        records: iterations done and diagnostics of the rows, for every report of a single problem.
+        began: for every attempt, after how many iterations it began and its noise ended.
+    """
+
+    attempt: int
+    cost_scale: np.ndarray
+    todo: np.ndarray
+    place: int
+    begun: bool
+    owners: np.ndarray
+    kept: Chains | None
+    now: Chains
+    damping: np.ndarray
+    step: int
+    rollouts: int
+    records: tuple[tuple[int, Info], ...]
+    began: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def done(self) -> int:
+        """Iterations of a single problem's search, at the last report."""
+        return self.records[-1][0]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search came to, before any replay.
+
+    Attributes:
+        chains: the best of every chain, (N * chains,) rows.
+        records, began: as in `Stage`; `records` holds what every place in the batch was at, which
+            in later attempts are other tries of fewer chains.
+        flow: the settings of the first attempt, in the first problem's scales.
+        compile_time, solve_time: [s].
+    """
+
+    chains: Chains
+    records: list[tuple[int, Info]]
+    began: list[tuple[int, int]]
+    flow: Langevin
+    compile_time: float
+    solve_time: float
+
+
+@dataclass
+class Search:
+    """The attempts of one call.
+
+    Attributes:
+        family: the problems.
+        chains: of each problem.
+        seed: of all random numbers.
+        settings: with a value for everything.
+        size: problems in a chunk.
+        mesh: the devices, or None for one.
+        guess: initial knots of a single problem.
+        checkpoint: where to write.
+        recorder: of a single problem's knots.
+        progress: called with (iterations done, of how many, diagnostics) for a single problem.
+        chunk_done: called with (problems done, of how many) after every chunk.
+    """
+
+    family: Family
+    chains: int
+    seed: int
+    settings: Restarts
+    size: int = 1
+    mesh: Mesh | None = None
+    guess: Trajectory | None = None
+    checkpoint: Checkpoint | None = None
+    recorder: Recorder | None = None
+    progress: Progress | None = None
+    chunk_done: Callable[[int, int], None] | None = None
+
+    stage: Stage = field(init=False)
+    flow: Langevin = field(init=False)
+    question: tuple[Question, Question] = field(init=False)
+    launch: Callable[..., Any] = field(init=False)
+    clock: float = field(init=False, default=0.0)
+
+    def run(self) -> Found:
+        """All attempts; Ctrl-C keeps what there is."""
+        clock = time.perf_counter()
+        if self.checkpoint is not None:
+            self._require(self.checkpoint)
+        self._begin_search()
+        first = self.flow
+        before, ended = self._resume()
+        answered = ended
+        if not answered:
+            self._compile_the_rest()
+        compile_time = time.perf_counter() - clock
+
+        self.clock = time.perf_counter() - before
+        try:
+            while not ended:
+                if not self.stage.begun:
+                    self._begin_chunk()
+                if not self._iterate() or not self._roll_out():
+                    break
+                ended = not self._next_chunk() and not self._next_attempt()
+        except KeyboardInterrupt:  # between two chunks
+            pass
+        if not answered:
+            self._save(ended, now=True)
+        found = self._merged() if self.stage.begun else self.stage.kept
+        assert found is not None
+        if jax.process_count() > 1:  # of a state that is split, the others hold a part
+            found = self._whole(found)
+        stage, solve_time = self.stage, time.perf_counter() - self.clock
+        records, began = list(stage.records), list(stage.began)
+        return Found(found, records, began, first, compile_time, solve_time)
+
+    # Attempts and chunks
+
+    @property
+    def indices(self) -> np.ndarray:
+        """Problems of the chunk, (size,); the last chunk is filled up with problems again."""
+        stage = self.stage
+        return np.resize(stage.todo[stage.place : stage.place + self.size], self.size)
+
+    def _begin_search(self) -> None:
+        """Initial knots of the first chunk, tried before anything long compiles."""
+        family, everyone = self.family, np.arange(self.family.count)
+        rows, scale = self.size * self.chains, np.ones(family.count)
+        indices = np.resize(everyone, self.size)
+        knots, keys = self._drawn(0, indices)
+        saved = self.checkpoint is not None and self.checkpoint.found is not None
+        one = family.at(0)
+        if not saved:
+            mine = jax.tree.map(lambda a: a[: self.chains], knots)
+            flow = self.settings.first(1.0)
+            require_sound(flow, one, mine, with_f=not family.problem.dynamics.checked)
+        self._settle(0, indices, scale)
+        state = begin(self.question[1], self.question[0], knots, keys)
+        zeros = jnp.zeros(rows)
+        info = Info(zeros, zeros, zeros)
+        if not saved:  # else it will be replaced; an answer needs no compiling
+            state, info = jax.block_until_ready(self._iterated(state, 0, 0))
+            require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
+        now = Chains(state, info, np.full(rows, -1))
+        kept = None if family.alone else _unset(now, family.count * self.chains)
+        owners, ones = np.tile(np.arange(self.chains), self.size), np.ones(rows)
+        records = ((0, info),)
+        self.stage = Stage(0, scale, everyone, 0, True, owners, kept, now, ones, 0, 0, records)
+        self._measure()
+
+    def _begin_chunk(self) -> None:
+        """New initial knots and random numbers for every row."""
+        stage, indices = self.stage, self.indices
+        owners = np.tile(np.arange(self.chains), self.size)
+        if stage.attempt > 0:
+            done = self._finished()[indices]
+            owners = np.concatenate([_owners(row) for row in done])
+        knots, keys = self._drawn(stage.attempt, indices)
+        self._settle(stage.attempt, indices, stage.cost_scale)
+        state = begin(self.question[1], self.question[0], knots, keys)
+        state, info = jax.block_until_ready(self._iterated(state, 0, 0))
+        now = Chains(state, info, np.full(len(owners), -1))
+        ones = np.ones(len(owners))
+        self.stage = replace(
+            stage, begun=True, owners=owners, now=now, damping=ones, step=0, rollouts=0
+        )
+        if stage.attempt == 0:
+            self._measure()
+
+    def _measure(self) -> None:
+        """The scale of costs of the chunk's problems, from the costs of their initial knots."""
+        stage, indices = self.stage, self.indices
+        costs = np.asarray(gathered(stage.now.info.cost, self.mesh))
+        scale = stage.cost_scale.copy()
+        scale[indices] = [cost_scale_of(row) for row in costs.reshape(self.size, self.chains)]
+        self.stage = replace(stage, cost_scale=scale)
+        self._settle(0, indices, scale)
+
+    def _next_chunk(self) -> bool:
+        """Keep the best of the chunk; whether the attempt has another."""
+        stage = self.stage
+        place = min(stage.place + self.size, len(stage.todo))
+        self.stage = replace(stage, kept=self._merged(), place=place, begun=False)
+        if not self.family.alone:
+            self._save()
+            if self.chunk_done is not None:
+                N, todo = self.family.count, len(stage.todo)
+                self.chunk_done(N - todo + place, N)
+        return place < len(stage.todo)
+
+    def _next_attempt(self) -> bool:
+        """Go on to another attempt; False if none is to be made."""
+        stage, settings = self.stage, self.settings
+        kept, shape = stage.kept, (self.family.count, self.chains)
+        assert kept is not None
+        assert settings.enough is not None
+        unfinished = (~self._finished()).sum(axis=1)
+        todo = np.flatnonzero(unfinished > (1.0 - settings.enough) * self.chains)
+        if stage.attempt + 1 == settings.attempts or not len(todo):
+            return False
+        scale = stage.cost_scale.copy()
+        infeasible = ~kept.feasible.reshape(shape).any(axis=1)
+        scale[infeasible] *= STRICTER  # the knots' cost says too little: penalize defects more
+        self.stage = replace(stage, attempt=stage.attempt + 1, cost_scale=scale, todo=todo, place=0)
+        return True
+
+    def _finished(self) -> np.ndarray:
+        """Which chains of all problems are done, (N, chains)."""
+        kept, shape = self.stage.kept, (self.family.count, self.chains)
+        assert kept is not None
+        cost, feasible = kept.cost.reshape(shape), kept.feasible.reshape(shape)
+        return finished(cost, feasible, self.settings.within, self.stage.cost_scale)
+
+    def _merged(self) -> Chains:
+        """The best of all attempts, this one included."""
+        stage, kept = self.stage, self.stage.kept
+        if kept is None:
+            return stage.now
+        now = self._whole(stage.now)
+        if self.family.alone:
+            return best_of(kept, now, stage.owners)
+        fresh = min(self.size, len(stage.todo) - stage.place)
+        of_problem = np.arange(self.chains)
+        rows = (self.indices[:fresh, None] * self.chains + of_problem).ravel()
+        first = np.repeat(np.arange(fresh) * self.chains, self.chains)
+        mine, found = (
+            jax.tree.map(lambda a, n=n: np.asarray(a)[n], chains)
+            for chains, n in ((kept, rows), (_slim(now), slice(len(rows))))
+        )
+        best = best_of(mine, found, stage.owners[: len(rows)] + first)
+        jax.tree.map(lambda a, new: a.__setitem__(rows, new), kept, best)
+        return kept
+
+    def _whole(self, chains: Chains) -> Chains:
+        """The chains with their states on one device."""
+        return replace(chains, state=gathered(chains.state, self.mesh))
+
+    def _drawn(self, attempt: int, indices: np.ndarray) -> tuple[Trajectory, Array]:
+        """Initial knots (rows, K, ...) and random keys (rows,) of an attempt on some problems."""
+        key = jax.random.fold_in(jax.random.key(self.seed), attempt)
+        if self.family.alone:
+            key_knots, key_noise = jax.random.split(key)
+            knots = initial_knots(self.family.problem, self.chains, self.guess, key_knots)
+            return knots, chain_keys(key_noise, self.chains)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(indices))
+        guess = self.family.problem.guess
+        _, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
+        shared, _ = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
+        return _drawn_by_row(own.problem, shared.problem, keys, self.chains, guess)
+
+    def _settle(self, attempt: int, indices: np.ndarray, cost_scale: np.ndarray) -> None:
+        """The flow and the question of an attempt on some problems."""
+        settings, cost = self.settings, cost_scale[indices]
+        heated, flow = attempt > 0 and settings.heated, settings.flow
+        noise = np.zeros(len(indices))
+        if settings.descent is None:
+            cost, noise = (np.broadcast_to(s, len(indices)) for s in vars(flow.scale).values())
+        elif not heated:
+            flow = replace(flow, iterations=settings.descent)
+        else:
+            kept = self.stage.kept
+            assert kept is not None
+            shape = self.family.count, self.chains
+            rows = kept.cost.reshape(shape)[indices], kept.feasible.reshape(shape)[indices]
+            noise = np.sqrt([temperature(*row) for row in zip(*rows, cost, strict=True)])
+        if self.family.alone:
+            if settings.descent is not None:
+                flow = replace(flow, scale=scale_of(cost[0], noise[0]))
+            self.flow = flow
+        else:
+            self.flow = replace(flow, scale=scale_of(1.0, 1.0))
+        self.question = self.family.question(self.flow, Scale(cost, noise), indices, self.chains)
+        program = partial(iterate, tail=int(flow.tail) > 0)
+        self.launch = spread(program, self.mesh, self.question[0])
+
+    # Iterations
+
+    def _iterated(self, state: State, start: int, stop: int) -> tuple[State, Info]:
+        """Iterations start..stop-1 on all devices, where the states then stay."""
+        rows = state, self.question[1]
+        state, info = self.launch(rows, start, stop, compiles=start == stop == 0)
+        return state, gathered(info, self.mesh)
+
+    def _iterate(self) -> bool:
+        """What is left of the iterations of an attempt; False if they are interrupted."""
+        stage, flow = self.stage, self.flow
+        if self.family.alone and len(stage.began) == stage.attempt:
+            noisy = int(flow.iterations) if noise_at(flow, 0) > 0.0 else 0
+            if self.recorder is not None:
+                self.recorder.begin(stage.owners)
+            self.stage = replace(stage, began=(*stage.began, (stage.done, stage.done + noisy)))
+            self._record()
+        total = flow.iterations + flow.tail
+        before = self.stage.done - self.stage.step
+        every = max(REPORT_EVERY, total // 100)
+        every = min(every, self.recorder.every) if self.recorder is not None else every
+        try:
+            while self.stage.step < total:
+                stage, now = self.stage, self.stage.now
+                stop = min(stage.step + every, total)
+                state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
+                died_at = np.asarray(gathered(state.died_at, self.mesh))
+                if stage.attempt == 0 and stage.step == 0 and (died_at == 0).all():
+                    knots = gathered(now.state.trajectory, self.mesh)
+                    require_sound(flow, self.family.at(0), knots)
+                feasible = np.asarray(info.max_defect) < FEASIBLE
+                since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
+                now = Chains(state, info, np.where(feasible, since, -1))
+                self._report(replace(stage, now=now, step=stop), before + stop)
+        except KeyboardInterrupt:  # the chains as they were at the last report
+            return False
+        return True
+
+    # Rollouts
+
+    def _roll_out(self) -> bool:
+        """The rollouts that follow an attempt; False if they are interrupted. See `Rollouts`."""
+        rollouts, stage = self.settings.rollouts, self.stage
+        assert rollouts is not None
+        total = rollouts.first + rollouts.rounds
+        if total == 0 or self.flow.tail < rollouts.iterations:
+            return True
+        if stage.now.feasible.all() and stage.rollouts == 0:
+            return True
+        try:
+            self.stage = replace(self.stage, now=self._whole(self.stage.now))
+            while self.stage.rollouts < total:
+                self._next_rollout(rollouts.first, rollouts.iterations, total)
+        except KeyboardInterrupt:
+            return False
+        return True
+
+    def _next_rollout(self, first: int, iterations: int, total: int) -> None:
+        """A rollout without feedback, then with it, then rounds of iterations and rollouts."""
+        stage, everyone = self.stage, np.arange(len(self.stage.owners))
+        now, damping, count = stage.now, stage.damping, stage.rollouts + 1
+        if stage.rollouts < first:
+            rolled = self._rolled_out(now, float(stage.rollouts > 0), stage.done)
+            self.stage = replace(stage, now=best_of(now, rolled, everyone), rollouts=count)
+            return
+        done, end = stage.done + iterations, self.flow.iterations + self.flow.tail
+        state = replace(now.state, damping=jnp.asarray(damping, now.state.damping.dtype))
+        state, info = self._iterated(state, end - iterations, end)
+        found = self._whole(Chains(state, info, np.full(len(everyone), done)))
+        found = best_of(found, self._rolled_out(found, 1.0, done), everyone)
+        better = _improved(now, found)
+        now = best_of(now, found, everyone)
+        factor = np.where(better, LESS_DAMPING, MORE_DAMPING)
+        damping = np.clip(damping * factor, *DAMPING_RANGE)
+        if not better.any() and (damping == DAMPING_RANGE[1]).all():
+            count = total  # more would change nothing
+        self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
+
+    def _rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
+        """Every chain's knots replaced by a rollout of its controls."""
+        problem, knots = self.family.problem, chains.state.trajectory
+        rows = self.family.rows(self.indices, self.chains)
+        gains, dtype = with_feedback * np.asarray(chains.state.gains), knots.x.dtype
+        start = jnp.broadcast_to(rows.x_init, (len(knots.x), problem.dynamics.nx))
+        plan = jnp.concatenate([start[:, None], knots.x], axis=1)
+        indices = np.repeat(self.indices, self.chains)
+        states, controls = self.family.replay(indices, plan, knots.u, gains)
+        rolled = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
+        state = restart_at(self.question[1], self.question[0], chains.state, rolled)
+        state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
+        return self._whole(Chains(state, info, np.full(len(knots.x), done)))
+
+    # Reports, recordings, checkpoints
+
+    def _report(self, stage: Stage, done: int) -> None:
+        """Go on to that stage, after `done` iterations: record it, keep it and tell."""
+        if self.family.alone:
+            stage = replace(stage, records=(*stage.records, (done, stage.now.info)))
+        self.stage = stage
+        self._record()
+        self._save()
+        if self.progress is not None:
+            self.progress(done, max(self.settings.iterations, done), stage.now.info)
+
+    def _record(self) -> None:
+        """Record knots too, if asked for."""
+        if self.recorder is not None:
+            stage, now = self.stage, self.stage.now
+            knots = gathered(now.state.trajectory, self.mesh)
+            sigma = noise_at(self.flow, stage.step)
+            self.recorder.take(self.family.problem, sigma, stage.done, knots, now.info)
+
+    def _compile_the_rest(self) -> None:
+        """What would else be compiled while the clock runs."""
+        now, settings = self.stage.now, self.settings
+        if settings.attempts > 1 and self.family.alone:
+            rows = np.arange(len(self.stage.owners))
+            _gather((now.state, now.info), (now.state, now.info), rows)
+        if self.recorder is not None:
+            knot_defects(self.family.problem, now.state.trajectory)
+        if self.family.alone:
+            noise_at(self.flow, 0)
+
+    def _require(self, checkpoint: Checkpoint) -> None:
+        """Complain now about a checkpoint of another question, or one that cannot be written."""
+        family, recorder, settings = self.family, self.recorder, self.settings
+        known = facts(family.problem, self.chains, self.seed, to_data(settings))
+        if family.alone:
+            what = {"call": "solve", "record": None if recorder is None else recorder.every}
+        else:
+            what = {"call": "solve_batch", "problems": family.count, "chunk": self.size}
+        checkpoint.require({**what, **known})
+        problem, rows = family.problem, self.size * self.chains
+        nx, nu, dtype = problem.dynamics.nx, problem.dynamics.nu, problem.x_init.dtype
+        ones = Scale(np.ones(self.size), np.ones(self.size))
+        shared, own = family.question(settings.flow, ones, np.zeros(self.size, int), self.chains)
+
+        def state() -> State:
+            x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))
+            return begin(own, shared, Trajectory(x, u), chain_keys(jax.random.key(0), rows))
+
+        def size(tree: Any) -> int:
+            return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+        whole, kept = jax.eval_shape(state), family.count * self.chains / rows
+        rounds = settings.rollouts.rounds if settings.rollouts else 0
+        reports, recording = settings.attempts * (100 + rounds), 0
+        if recorder is not None:
+            reports += settings.iterations // recorder.every
+            snapshots = reports * rows * (nx + 2) * problem.horizon * dtype.itemsize
+            recording = min(LIMIT, snapshots)
+        checkpoint.require_room(
+            int((1 + kept) * size(whole)) + reports * 3 * rows * dtype.itemsize + recording
+        )
+
+    def _resume(self) -> tuple[float, bool]:
+        """Go on from a checkpoint; how long solving took so far, and whether it ended."""
+        checkpoint, stage = self.checkpoint, self.stage
+        if checkpoint is None:
+            return 0.0, False
+        state, tail = stage.now.state, int(self.flow.tail) > 0
+        checkpoint.require({"initial knots": digest(state.trajectory)})
+        program = iterate.lower((state, self.question[1]), self.question[0], 0, 0, tail)
+        checkpoint.require({"functions": digest(program.as_text())})
+        if checkpoint.found is None:
+            return 0.0, False
+        if self.family.alone and "stage.kept.feasible_since" in checkpoint.found:
+            self.stage = replace(stage, kept=stage.now)
+        saved = checkpoint.restored(self._saved(0.0, False))
+        iterations, infos = saved["iterations"].tolist(), saved["infos"]
+        records = [
+            (n, jax.tree.map(lambda rows, i=i: rows[i], infos)) for i, n in enumerate(iterations)
+        ]
+        began = tuple((int(a), int(b)) for a, b in saved["began"])
+        self.stage = stage = replace(saved["stage"], records=tuple(records), began=began)
+        if self.recorder is not None:
+            self.recorder.restore(saved["recorder"])
+        if not saved["ended"]:
+            self._settle(stage.attempt, self.indices, stage.cost_scale)
+            jax.block_until_ready(self._iterated(state, 0, 0))  # just compiles
+        return saved["solve_time"], saved["ended"]
+
+    def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        stage, recorder = self.stage, self.recorder
+        iterations, infos = zip(*stage.records, strict=True)
+        return {
+            "stage": replace(stage, records=(), began=()),
+            "iterations": np.array(iterations),
+            "infos": jax.tree.map(lambda *rows: np.stack(rows), *infos),
+            "began": np.array(stage.began, int),
+            "recorder": None if recorder is None else recorder.saved(),
+            "solve_time": solve_time,
+            "ended": ended,
+        }
+
+    def _save(self, ended: bool = False, now: bool = False) -> None:
+        """Write a checkpoint, if one is asked for and it is time to."""
+        if self.checkpoint is not None:
+            solve_time = time.perf_counter() - self.clock
+            self.checkpoint.save(lambda: self._saved(solve_time, ended), now)
+
+
+@partial(jax.jit, static_argnames=("chains", "guess"))
+def _drawn_by_row(
+    own: Problem, shared: Problem, keys: Array, chains: int, guess: Any
+) -> tuple[Trajectory, Array]:
+    """Initial knots of every chain of every problem, and their keys, in one axis of rows."""
+
+    def of_problem(own: Problem, key: Array) -> tuple[Trajectory, Array]:
+        problem = replace(joined(shared, own), guess=guess)
+        knots = initial_knots(problem, chains, None, jax.random.fold_in(key, 0))
+        return knots, chain_keys(jax.random.fold_in(key, 1), chains)
+
+    both = jax.vmap(of_problem)(own, keys)
+    rows: tuple[Trajectory, Array] = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), both)
+    return rows
+
+
+def chain_keys(key: Array, chains: int) -> Array:
+    """The key of each chain, so that results do not depend on how chains are split over calls."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
+
+
+def _slim(chains: Chains) -> Chains:
+    """The chains with what thousands of problems keep of them: knots and gains."""
+    state = chains.state
+    knots = replace(state.trajectory, slack=None)
+    nothing: Any = ()
+    slim = State(knots, nothing, nothing, state.gains, nothing, nothing, nothing, nothing)
+    return replace(chains, state=slim)
+
+
+def _unset(like: Chains, rows: int) -> Chains:
+    """Places on the host for the best of so many chains, infinitely bad so far."""
+    empty: Chains = jax.tree.map(lambda a: np.zeros((rows, *a.shape[1:]), a.dtype), _slim(like))
+    worst = Info(*(np.full(rows, np.inf) for _ in range(3)))
+    return replace(empty, info=worst, feasible_since=np.full(rows, -1))
+
+
+def _owners(done: np.ndarray) -> np.ndarray:
+    """For which chain each place of a problem works: those that are not done, in turn, (chains,)."""
+    return np.resize(np.flatnonzero(~done) if not done.all() else [0], len(done))
+
+
+def _median(costs: np.ndarray) -> float:
+    """Median of the absolute values of finite costs."""
+    finite = np.abs(costs[np.isfinite(costs)])
+    return float(np.median(finite)) if finite.size else 0.0
+
+
+def cost_scale_of(costs: np.ndarray) -> float:
+    """The scale of costs, from the costs of initial knots (chains,)."""
+    return COST_SCALE * _median(costs) or 1.0
+
+
+def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: float) -> float:
+    """The scale of the costs of answers: the best so far, or what all have if none is feasible."""
+    scale = abs(costs[feasible].min()) if feasible.any() else _median(costs)
+    return max(float(scale), NEGLIGIBLE * cost_scale)
+
+
+def finished(
+    costs: np.ndarray, feasible: np.ndarray, within: float, cost_scale: ArrayLike
+) -> np.ndarray:
+    """Which chains are done, (..., chains), for one problem or several with scales (...,)."""
+    costs = np.where(feasible, costs, np.inf)
+    best = costs.min(axis=-1, keepdims=True)
+    known = np.isfinite(best)
+    margin = np.maximum(within * np.abs(best), NEGLIGIBLE * np.expand_dims(cost_scale, -1))
+    return np.where(known, costs <= best + np.where(known, margin, 0.0), feasible)
+
+
+def _improved(kept: Chains, found: Chains) -> np.ndarray:
+    """Which chains became feasible, or cheaper by more than `CHEAPER`, (chains,)."""
+    before, after = (np.asarray(a.info.cost, float) for a in (kept, found))
+    cheaper = after < before - CHEAPER * np.abs(before)
+    return found.feasible & (cheaper | ~kept.feasible)
+
+
+def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
+    """For every chain the best of what it has and of what was found for it.
+
+    owners (chains,) says for which chain each row of `found` has worked. Feasible beats infeasible,
+    then the cheaper or the less infeasible wins.
+    """
+    chains = len(owners)
+
+    def both(values: Callable[[Chains], ArrayLike]) -> np.ndarray:
+        return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
+
+    infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
+    of = np.concatenate([np.arange(chains), owners])
+    order = np.lexsort((value, infeasible, of))
+    source = order[np.unique(of[order], return_index=True)[1]]
+    pairs = (kept.state, kept.info), (found.state, found.info)
+    if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(pairs)):
+        state, info = jax.tree.map(lambda a, b: np.concatenate([a, b])[source], *pairs)
+    else:
+        state, info = _gather(*pairs, source)
+    return Chains(state, info, both(lambda a: a.feasible_since)[source])
+
+
+@jax.jit
+def _gather(kept: Any, found: Any, source: Array) -> Any:
+    """Rows `source` (chains,) of two batches, one after the other."""
+    chains = len(source)
+
+    def rows(a: Array, b: Array) -> Array:
+        mine = (source < chains).reshape(-1, *[1] * (a.ndim - 1))
+        return jnp.where(mine, a[source % chains], b[source % chains])
+
+    return jax.tree.map(rows, kept, found)

@@ -1,0 +1,221 @@
+"""Problems that differ in numbers only: what all have in common, and what each has of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax.base.errors import DraxError, reason, shown
+from mjx_drax.base.pytrees import with_host_fields
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.method.schedules import Scale
+from mjx_drax.problem.problem import Problem, checked
+from mjx_drax.problem.tracing import plain
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.iterate import Question, cost_and_violation, partition
+
+
+@dataclass(frozen=True)
+class Family:
+    """Problems that differ in some of their numbers.
+
+    Attributes:
+        problem: all of them; leaves that differ have a leading axis (N, ...).
+        differs: which leaves, in the order of `jax.tree.leaves`.
+        count: N.
+    """
+
+    problem: Problem
+    differs: tuple[bool, ...]
+    count: int
+
+    @property
+    def alone(self) -> bool:
+        """Whether this is one problem by itself."""
+        return not any(self.differs)
+
+    @classmethod
+    def of_one(cls, problem: Problem) -> Family:
+        """One problem by itself."""
+        return cls(problem, (False,) * len(jax.tree.leaves(problem)), 1)
+
+    @classmethod
+    def of(cls, make: Callable[[Any], Problem], values: Any) -> Family:
+        """The problems make(value) for values stacked along the first axis of every leaf.
+
+        Raises:
+            DraxError: leaves of `values` without a common first axis, or a misfit in the first
+                problem.
+        """
+        if not callable(make):
+            raise DraxError(f"make is {shown(make)}: give a function of a value, to a Problem.")
+        try:
+            values = jax.tree.map(jnp.asarray, values)
+        except (TypeError, ValueError) as error:
+            raise DraxError(
+                f"values are {shown(values)}: give arrays of numbers, one entry for each problem."
+            ) from error
+        counts = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
+        if len(counts) != 1 or not min(counts) or min(counts)[0] < 1:
+            raise DraxError(
+                f"values have first axes {sorted(counts)}: stack one entry for each problem along "
+                "the first axis of every array."
+            )
+        count = min(counts)[0]
+
+        def nth(i: int) -> Problem:
+            try:
+                return make(jax.tree.map(lambda leaf: leaf[i], values))
+            except DraxError:
+                raise
+            except Exception as error:
+                raise DraxError(
+                    f"make failed for value {i}: {reason(error)}. Make it a function of one value "
+                    "that returns a Problem."
+                ) from error
+
+        first, last = checked(nth(0)), nth(count - 1)
+        leaves, others = jax.tree.leaves(first), jax.tree.leaves(last)
+        if len(leaves) != len(others):
+            raise DraxError("make gives problems of different structure: vary numbers only.")
+        differs = tuple(a is not b for a, b in zip(leaves, others, strict=True))
+        if not any(differs):
+            raise DraxError(
+                "make gives the same problem for every value: let it change some number."
+            )
+        tree: list[Any] = []
+
+        @jax.jit
+        @jax.vmap
+        def differing(value: Any) -> list[Array]:
+            try:
+                found, structure = jax.tree.flatten(make(value))
+            except Exception as error:  # numbers were no trouble, above
+                ours = isinstance(error, DraxError)
+                words = "what it builds takes numbers, not traced values" if ours else plain(error)
+                raise DraxError(
+                    f"make failed when it was traced: {words}. Make it a JAX function, "
+                    "such as lambda x: dataclasses.replace(problem, x_init=x)."
+                ) from error
+            tree.append(structure)
+            return [jnp.asarray(a) for a, d in zip(found, differs, strict=True) if d]
+
+        stacked = iter(differing(values))
+        merged = [next(stacked) if d else a for a, d in zip(leaves, differs, strict=True)]
+        whole = with_host_fields(jax.tree.unflatten(tree[0], merged), first)
+        family = cls(whole, differs, count)
+        if family.varies("dynamics") and first.dynamics.fingerprint():
+            raise DraxError(
+                f"make changes the dynamics of {first.name}, and the C engine would "
+                "replay another: solve for each model by itself."
+            )
+        family._check()
+        return family
+
+    def _check(self) -> None:
+        """Complain about numbers of single problems that no solve could use."""
+        leaves = zip(jax.tree.leaves(self.problem), self.differs, strict=True)
+        numbers = [np.asarray(leaf) for leaf, differs in leaves if differs]
+        nan = np.any([np.isnan(n).reshape(self.count, -1).any(1) for n in numbers], axis=0)
+        faults = np.asarray(self.mapped(_faults))
+        for wrong, words in (
+            (nan, "holds NaN: give numbers"),
+            (faults[:, 0], "starts at infinity: give a finite x_init"),
+            (faults[:, 1], "has bounds that cross: give lower <= upper"),
+            (faults[:, 2], "starts outside the bounds of x: move its x_init, or widen the bounds"),
+        ):
+            if wrong.any():
+                raise DraxError(
+                    f"problem {int(np.argmax(wrong))} of {self.count} ({int(wrong.sum())} such) "
+                    f"{words}."
+                )
+
+    def _changed(self, change: Callable[[Any], Any]) -> Problem:
+        """The problem with another value for each leaf that differs."""
+        leaves, tree = jax.tree.flatten(self.problem)
+        new = [change(a) if d else a for a, d in zip(leaves, self.differs, strict=True)]
+        return with_host_fields(jax.tree.unflatten(tree, new), self.problem)
+
+    def varies(self, *names: str) -> bool:
+        """Whether any number in those attributes of the problem differs."""
+        tree = jax.tree.structure(self.problem)
+        differs = jax.tree.unflatten(tree, self.differs)
+        return any(any(jax.tree.leaves(getattr(differs, name))) for name in names)
+
+    def at(self, i: int) -> Problem:
+        """One of the problems."""
+        if self.alone:
+            return self.problem
+        return self._changed(lambda leaf: leaf[i])
+
+    def rows(self, indices: np.ndarray, chains: int) -> Problem:
+        """Those problems, with a row for each of their chains in the leaves that differ."""
+        if self.alone:
+            return self.problem
+        which = np.repeat(indices, chains)
+        return self._changed(lambda leaf: leaf[which])
+
+    def question(
+        self, flow: Langevin, scale: Scale, indices: np.ndarray, chains: int
+    ) -> tuple[Question, Question]:
+        """What the chains of those problems share, and what each has of its own.
+
+        Args:
+            flow: the settings of all.
+            scale: cost and noise of each problem, (len(indices),).
+            indices: of the problems.
+            chains: of each problem.
+        """
+        if self.alone:
+            return partition(Question(flow, self.problem), None)
+        each = Scale(*(np.repeat(np.asarray(s), chains) for s in (scale.cost, scale.noise)))
+        whole = Question(replace(flow, scale=each), self.rows(indices, chains))
+        flags = jax.tree.map(lambda leaf: False, flow)
+        of_flow = jax.tree.leaves(replace(flags, scale=Scale(True, True)))
+        return partition(whole, (*of_flow, *self.differs, False))
+
+    def mapped(self, function: Callable[[Problem], Any]) -> Any:
+        """function(problem) for every problem, (N, ...)."""
+        tree = jax.tree.structure(self.problem)
+        axes = jax.tree.unflatten(tree, [0 if d else None for d in self.differs])
+        return jax.vmap(function, in_axes=(axes,))(self.problem)
+
+    def cost_and_violation(self, knots: Trajectory) -> tuple[Array, Array]:
+        """Cost and bound violation of a trajectory for each problem, (N,), from knots (N, ...)."""
+        leaves, tree = jax.tree.flatten(self.problem)
+        parts = (
+            [leaf if d is own else None for leaf, d in zip(leaves, self.differs, strict=True)]
+            for own in (True, False)
+        )
+        return cost_and_violation(*(jax.tree.unflatten(tree, part) for part in parts), knots)
+
+    def replay(
+        self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`Problem.replay` of one plan of each of those problems, (len(indices), ...)."""
+        if not self.varies("dynamics", "bounds"):
+            return self.problem.replay(plan, u, gains)
+        ran = [
+            self.at(int(i)).replay(*(a[k : k + 1] for a in (plan, u, gains)))
+            for k, i in enumerate(indices)
+        ]
+        return np.concatenate([run[0] for run in ran]), np.concatenate([run[1] for run in ran])
+
+
+def _faults(problem: Problem) -> Array:
+    """Whether x_init is not finite, bounds cross, and x_init is outside of them, (3,)."""
+    box, x = problem.bounds, problem.x_init
+
+    def above(lower: Array, upper: Array) -> Array:
+        return (lower - upper > 1e-6).any()
+
+    crossed = above(box.x_lower, box.x_upper) | above(box.u_lower, box.u_upper)
+    outside = above(box.x_lower, x) | above(x, box.x_upper)
+    alike = box.x_lower.ndim == box.x_upper.ndim == 1  # bounds of single knots do not hold for x_0
+    return jnp.stack([~jnp.isfinite(x).all(), crossed, outside & alike])

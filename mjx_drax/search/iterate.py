@@ -1,0 +1,223 @@
+"""The compiled loops over iterations: many chains at once, of one problem or of many.
+
+Chains are rows. What all rows share (settings, functions, most numbers of a problem) stands once;
+what differs from row to row has a leading axis. `Question` holds both, and `partition` parts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.kernels.compilation import compiled
+from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.kernels.pruning import pruned
+from mjx_drax.method.descent import Info, diagnosed
+from mjx_drax.method.gauss_newton import GaussNewton
+from mjx_drax.method.langevin import Langevin, State
+from mjx_drax.method.model import expand
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
+
+FEASIBLE = 1e-3
+"""Largest max|h| that counts as feasible."""
+
+Tree = TypeVar("Tree")
+
+
+class Question(NamedTuple):
+    """What a row works on: a flow, a problem, and a number added to its iterations."""
+
+    flow: Langevin
+    problem: Problem
+    offset: Any = np.int32(0)
+
+
+def partition(question: Question, differs: tuple[bool, ...] | None) -> tuple[Question, Question]:
+    """The leaves that all rows share and those that have an axis of rows, None for the others.
+
+    Args:
+        question: the leaves that differ have a leading axis.
+        differs: which do, in the order of `jax.tree.leaves`; None: none.
+    """
+    leaves, tree = jax.tree.flatten(question)
+    differs = differs or (False,) * len(leaves)
+    parts = (
+        [leaf if d is own else None for leaf, d in zip(leaves, differs, strict=True)]
+        for own in (False, True)
+    )
+    shared, own = (jax.tree.unflatten(tree, part) for part in parts)
+    return shared, own
+
+
+def joined(shared: Tree, own: Tree) -> Tree:
+    """What `partition` parted, whole again."""
+    whole: Tree = jax.tree.map(
+        lambda a, b: b if a is None else a, shared, own, is_leaf=lambda leaf: leaf is None
+    )
+    return whole
+
+
+def _by_row(shared: Question, own: Question, function: Callable[..., Any], *rows: Any) -> Any:
+    """function(question, *row) of every row."""
+    return jax.vmap(lambda own, *row: function(joined(shared, own), *row))(own, *rows)
+
+
+@jax.jit
+def begin(own: Question, shared: Question, knots: Trajectory, keys: Array) -> State:
+    """The first state of chains that start at the given knots (rows, K, ...), keys (rows,)."""
+    return _by_row(shared, own, lambda q, *given: q.flow.init(q.problem, *given), knots, keys)
+
+
+@jax.jit
+def restart_at(own: Question, shared: Question, states: State, knots: Trajectory) -> State:
+    """The chains with other knots (rows, K, ...), and slacks that go with them."""
+    inside = _by_row(shared, own, lambda q, z: q.flow.inside(q.problem, z), knots)
+    return State(**{**vars(states), "trajectory": inside})
+
+
+@partial(compiled, static_argnames="tail")
+@full_precision
+def iterate(
+    rows: tuple[State, Question],
+    shared: Question,
+    start: ArrayLike,
+    stop: ArrayLike,
+    tail: bool = True,
+) -> tuple[State, Info]:
+    """Iterations start..stop-1 of every chain, and diagnostics of where they end.
+
+    Both ends are traced: any number of iterations runs the same compiled loop, and none at all
+    (start = stop) just diagnoses. Where f has kinks, as in models with contacts, the loop takes one
+    round more, which diagnoses by the f that the loop holds: such programs compile for as long as
+    they are, and most of their length is f.
+
+    Args:
+        rows: the chains, and what differs from row to row.
+        shared: what does not.
+        start, stop: iterations.
+        tail: as in `Langevin.step` (static).
+    """
+    return loop(rows, shared, start, stop, tail)
+
+
+def loop(
+    rows: tuple[State, Question],
+    shared: Question,
+    start: ArrayLike,
+    stop: ArrayLike,
+    tail: bool = True,
+    diagnose: bool = True,
+) -> tuple[State, Any]:
+    """`iterate`, inside of a compiled function; without diagnostics if not asked to `diagnose`."""
+    states, own = rows
+
+    def one(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
+        return q.flow.step(q.problem, state, i + q.offset, tail, moves)
+
+    if diagnose and tail and shared.problem.dynamics.kinked:
+
+        @pruned  # jit does it to all but the bodies of loops
+        def step_or_diagnose(i: Array, carry: tuple[State, Info]) -> tuple[State, Info]:
+            moved: Any = _by_row(shared, own, partial(one, i, i < stop), carry[0])
+            return moved
+
+        zeros = jnp.zeros(states.alive.shape)
+        none = Info(zeros, zeros, zeros)
+        return jax.lax.fori_loop(start, jnp.asarray(stop) + 1, step_or_diagnose, (states, none))
+
+    @pruned
+    def step(i: Array, states: State) -> State:
+        moved: State = _by_row(shared, own, partial(one, i, None), states)[0]
+        return moved
+
+    states = jax.lax.fori_loop(start, stop, step, states)
+    if not diagnose:
+        return states, None
+
+    def diagnosis(q: Question, knots: Trajectory) -> Info:
+        return diagnosed(q.problem, knots, q.problem.values(knots))
+
+    return states, _by_row(shared, own, diagnosis, states.trajectory)
+
+
+@jax.jit
+@full_precision
+def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
+    """Cost, max|h| and bound violation of a batch of trajectories of one problem."""
+    return jax.vmap(lambda z: diagnosed(problem, z, problem.values(z)))(trajectory)
+
+
+@jax.jit
+@full_precision
+def cost_and_violation(
+    own: Problem, shared: Problem, trajectory: Trajectory
+) -> tuple[Array, Array]:
+    """Cost and bound violation of every row's trajectory: `evaluate` without compiling f."""
+
+    def of_row(q: Any, z: Trajectory) -> tuple[Array, Array]:
+        return q.cost(z), q.bounds.violation(z)
+
+    found: tuple[Array, Array] = _by_row(shared, own, of_row, trajectory)  # type: ignore[arg-type]
+    return found
+
+
+@jax.jit
+@full_precision
+def feedback_gains(own: Question, shared: Question, states: State) -> Array:
+    """Time-varying LQR gains (rows, K, nu, ndx) for a flow whose metric brings none."""
+
+    def gains(q: Question, state: State) -> Array:
+        metric, flow = GaussNewton(), q.flow
+        knots, weights = state.trajectory, flow.weights(2.0)
+        key = jax.random.split(state.key)[0]
+        present = state.multipliers, weights, metric.derivatives
+        model = expand(q.problem, flow.bounds, knots, *present, key)
+        return metric.direction(q.problem, model, False, state.key, ()).gains
+
+    found: Array = _by_row(shared, own, gains, states)
+    return found
+
+
+_weights = jax.jit(Langevin.weights)
+
+
+def noise_at(flow: Langevin, iteration: int) -> float:
+    """The noise sigma that an iteration, from 0, adds; 0 in the tail."""
+    if iteration >= flow.iterations:
+        return 0.0
+    return float(_weights(flow, iteration / max(flow.iterations - 1, 1)).noise)
+
+
+def start(flow: Langevin, problem: Problem, knots: Trajectory, key: Array) -> State:
+    """Chains of one problem at given knots (chains, K, ...); chain c has the key fold_in(key, c)."""
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(len(knots.u)))
+    shared, own = partition(Question(flow, problem), None)
+    return begin(own, shared, knots, keys)
+
+
+def advance(
+    flow: Langevin,
+    problem: Problem,
+    states: State,
+    start: ArrayLike,
+    stop: ArrayLike,
+    tail: bool = True,
+) -> tuple[State, Info]:
+    """`iterate` for chains of one problem and one flow."""
+    shared, own = partition(Question(flow, problem), None)
+    return iterate((states, own), shared, start, stop, tail)
+
+
+def ranking(cost: ArrayLike, max_defect: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Sort keys of chains (...,), best first: infeasible, then cost, or max|h| if infeasible."""
+    defect = np.nan_to_num(np.asarray(max_defect), nan=np.inf)
+    infeasible = defect >= FEASIBLE
+    return infeasible, np.where(infeasible, defect, np.asarray(cost))

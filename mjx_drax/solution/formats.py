@@ -1,0 +1,260 @@
+"""Files for other programs: states and controls as CSV, keyframes as MJCF, trajectories as HDF5.
+
+They hold what was replayed, not what was planned; a dataset holds both.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import numpy.typing as npt
+
+from mjx_drax import __version__
+from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import complete, file_path, require
+from mjx_drax.physics.dynamics import MjxDynamics, mujoco_model
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.source import Source
+from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.problem import Problem
+from mjx_drax.solution.export import NothingToExport
+from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
+from mjx_drax.solution.solution import Solution
+
+DATASET_FORMAT = 1
+"""Of HDF5 files; changes whenever what they hold is named or shaped otherwise."""
+
+_POSITIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
+}
+_VELOCITIES = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
+}
+
+
+# Names
+
+
+def state_names(dynamics: Dynamics) -> list[str]:
+    """Names of the entries of a state, nx of them.
+
+    For a model qpos_JOINT, qvel_JOINT and act_ACTUATOR, in MuJoCo's units; joints with several
+    coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise x0,
+    x1, ...
+    """
+    model = mujoco_model(dynamics)
+    if model is None:
+        return [f"x{i}" for i in range(dynamics.nx)]
+    return [
+        *_joint_names(model, "qpos", _POSITIONS),
+        *_joint_names(model, "qvel", _VELOCITIES),
+        *_activation_names(model),
+    ]
+
+
+def control_names(dynamics: Dynamics) -> list[str]:
+    """Names of the entries of a control, nu of them: ctrl_ACTUATOR, or u0, u1, ..."""
+    model = mujoco_model(dynamics)
+    if model is None:
+        return [f"u{i}" for i in range(dynamics.nu)]
+    return [f"ctrl_{model.actuator(i).name or i}" for i in range(model.nu)]
+
+
+def _joint_names(
+    model: mujoco.MjModel, kind: str, parts: dict[int, tuple[str, ...]]
+) -> Iterator[str]:
+    for i in range(model.njnt):
+        name = f"{kind}_{model.joint(i).name or i}"
+        for part in parts.get(int(model.jnt_type[i]), ("",)):
+            yield f"{name}_{part}" if part else name
+
+
+def _activation_names(model: mujoco.MjModel) -> Iterator[str]:
+    for i in range(model.nu):
+        name, count = model.actuator(i).name or i, int(model.actuator_actnum[i])
+        for part in range(count):
+            yield f"act_{name}" if count == 1 else f"act_{name}_{part}"
+
+
+# CSV
+
+
+def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
+    """Write the best chain's replay as a table, one row a knot; returns its path.
+
+    Columns: time [s], then `state_names` and `control_names`. Row k holds x_k and the control u_k
+    that acts from there; the last row has no control.
+
+    Args:
+        solution: from `solve`.
+        path: where to, ending in .csv.
+
+    Raises:
+        DraxError: the path cannot be written.
+    """
+    states, controls = solution.replayed
+    dynamics = solution.problem.dynamics
+    with complete(path, (".csv",)) as partial, partial.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["time", *state_names(dynamics), *control_names(dynamics)])
+        for k, (time, x) in enumerate(zip(solution.problem.times, states, strict=True)):
+            u = controls[k] if k < len(controls) else [""] * dynamics.nu
+            table.writerow([f"{time:.9g}", *x, *u])
+    return file_path(path)
+
+
+# Keyframes
+
+
+def mjcf_of(problem: Problem) -> tuple[mujoco.MjModel, Source]:
+    """A problem's model, and its MJCF with the files that it needs.
+
+    Raises:
+        DraxError: the problem has no model, or its MJCF is not known or has changed.
+    """
+    if not isinstance(problem.dynamics, MjxDynamics):
+        raise DraxError(
+            f"{problem.name} has no MuJoCo model to write keyframes of, its dynamics are a "
+            "function: see --csv or save_csv."
+        )
+    return problem.dynamics.mj_model, problem.dynamics.source()
+
+
+def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
+    """Write the model with the replay as its keyframes, for any MuJoCo viewer; returns the path.
+
+    Keyframe `replay_k` holds time, qpos, qvel, act and ctrl at knot k, after those that the model
+    has. Meshes, textures and height fields are copied into a folder beside the file, NAME_assets,
+    so both can be moved together. Other numbers of the model are as MuJoCo writes them, with six
+    digits.
+
+    Args:
+        solution: from `solve`, of a problem from an MJCF file or string.
+        path: where to, ending in .xml.
+
+    Raises:
+        DraxError: there is no MJCF, it has changed since, or the path cannot be written.
+    """
+    model, source = mjcf_of(solution.problem)
+    target = file_path(path)
+    folder = f"{target.stem}_assets"
+    before, end, _ = source.in_folder(folder if source.assets else "").xml.rpartition("</mujoco>")
+    keys = "\n".join(_keys(solution, model))
+    with complete(target, (".xml",)) as partial:
+        for name, content in source.assets.items():
+            with complete(target.parent / folder / name) as file:
+                file.write_bytes(content)
+        text = f"{before}  <keyframe>\n{keys}\n  </keyframe>\n{end}\n"
+        partial.write_text(text, encoding="utf-8")
+    return target
+
+
+def _keys(solution: Solution, model: mujoco.MjModel) -> Iterator[str]:
+    """One element a knot; the last one keeps the last control."""
+    states, controls = solution.replayed
+    ends = [model.nq, model.nq + model.nv]
+    for k, (time, x) in enumerate(zip(solution.problem.times, states, strict=True)):
+        if not np.isfinite(x).all():
+            break
+        parts = dict(zip(("qpos", "qvel", "act"), np.split(x, ends), strict=True))
+        parts["ctrl"] = controls[min(k, len(controls) - 1)]
+        numbers = "".join(f" {n}={quoteattr(_numbers(v))}" for n, v in parts.items() if v.size)
+        yield f'    <key name="replay_{k}" time="{time:.9g}"{numbers}/>'
+
+
+def _numbers(values: npt.ArrayLike) -> str:
+    return " ".join(f"{v:.17g}" for v in np.nan_to_num(np.asarray(values, float)))
+
+
+# Datasets
+
+
+def require_h5py() -> None:
+    """Complain if `save_dataset` cannot work; call it before a long computation."""
+    require("h5py", "dataset", "a dataset")
+
+
+def save_dataset(
+    solutions: Solution | Sequence[Solution],
+    path: str | os.PathLike[str],
+    everything: bool = False,
+) -> Path:
+    """Write trajectories of many chains as HDF5, for learning from; returns the path.
+
+    One group a solution, `000_NAME`, with n trajectories of K knots: times (K+1,); states (n, K+1,
+    nx) and controls (n, K, nu) as replayed, float64; plan_states, plan_controls and gains (n, K,
+    nu, ndx), float32; mode (n,), `open loop` where that succeeds, else `with feedback`; and of that
+    replay max_deviation, final_deviation, max_violation, replay_cost and success, (n,) each; chain,
+    cost and max_defect of the plan, feasible. Attributes: problem, engine, seed, dt, state_names,
+    control_names; of the file: format, mjx_drax.
+
+    Args:
+        solutions: one, or several, from `solve` or `Solution.load`.
+        path: where to, ending in .h5 or .hdf5.
+        everything: also chains that are not certified; otherwise only those that are feasible and
+            whose replay in that mode succeeds.
+
+    Raises:
+        DraxError: h5py is not installed, nothing is certified, or the path cannot be written.
+    """
+    require_h5py()
+    import h5py
+
+    solutions = [solutions] if isinstance(solutions, Solution) else list(solutions)
+    tables = [_trajectories(solution, everything) for solution in solutions]
+    if not sum(len(table["chain"]) for table in tables):
+        raise NothingToExport(
+            "no chain is certified, so the dataset would be empty: solve with more chains, or pass "
+            "everything=True for what there is."
+        )
+    with complete(path, (".h5", ".hdf5")) as partial, h5py.File(partial, "w") as file:
+        file.attrs["format"], file.attrs["mjx_drax"] = DATASET_FORMAT, __version__
+        for i, (solution, table) in enumerate(zip(solutions, tables, strict=True)):
+            problem = solution.problem
+            group = file.create_group(f"{i:03d}_{problem.name.replace('/', '_')}")
+            group.attrs["problem"], group.attrs["engine"] = problem.name, solution.engine
+            group.attrs["seed"], group.attrs["dt"] = solution.seed, float(problem.dynamics.dt)
+            group.attrs["state_names"] = state_names(problem.dynamics)
+            group.attrs["control_names"] = control_names(problem.dynamics)
+            for name, values in {"times": problem.times, **table}.items():
+                group.create_dataset(name, data=values)
+    return file_path(path)
+
+
+def _trajectories(solution: Solution, everything: bool) -> dict[str, Any]:
+    """The trajectories of one solution, cheapest first, replayed in their modes."""
+    open_loop, feedback = solution.open_loop, solution.feedback
+    order = np.argsort(solution.cost, kind="stable")
+    chains = order[solution.certified_chains[order] | everything]
+    is_open = open_loop.success[chains]
+
+    def replayed(name: str) -> np.ndarray:
+        one, other = (getattr(replays, name)[chains] for replays in (open_loop, feedback))
+        return np.where(is_open.reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+    plans = np.asarray(solution.problem.with_start(solution.trajectories))
+    return {
+        "states": replayed("states"),
+        "controls": replayed("controls"),
+        "plan_states": plans[chains],
+        "plan_controls": solution.trajectories.u[chains],
+        "gains": solution.gains[chains],
+        "mode": [OPEN_LOOP if o else WITH_FEEDBACK for o in is_open],
+        "max_deviation": replayed("max_deviation"),
+        "final_deviation": replayed("final_deviation"),
+        "max_violation": replayed("max_violation"),
+        "replay_cost": replayed("cost"),
+        "success": replayed("success"),
+        "chain": chains,
+        "cost": solution.cost[chains],
+        "max_defect": solution.max_defect[chains],
+        "feasible": solution.feasible[chains],
+    }

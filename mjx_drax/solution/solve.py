@@ -1,0 +1,121 @@
+"""Solve one problem, and certify the answer by replaying it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from mjx_drax.base.errors import DraxError
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.problem.problem import Problem, checked
+from mjx_drax.problem.tracing import require_functions
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.checkpoint import Checkpoint
+from mjx_drax.search.devices import mesh_for
+from mjx_drax.search.engine import Found, Progress, Search
+from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import Question, feedback_gains, partition
+from mjx_drax.search.recording import Recorder
+from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.solution.replay import replays
+from mjx_drax.solution.solution import Solution
+
+
+def solve(
+    problem: Problem,
+    chains: int = 64,
+    seed: int = 0,
+    solver: Langevin | Restarts | None = None,
+    guess: Trajectory | None = None,
+    progress: Progress | None = None,
+    record: int | None = None,
+    devices: int = 1,
+    checkpoint: str | os.PathLike[str] | None = None,
+) -> Solution:
+    """Run `chains` Langevin chains and replay what they found.
+
+    Args:
+        problem: from `from_mjcf` or `from_function`.
+        chains: number of chains.
+        seed: of all random numbers.
+        solver: `Restarts()` by default, whose settings are scaled from the problem; or one
+            `Langevin` with its schedules as they stand.
+        guess: initial knots instead of random ones: one trajectory for all chains, (K, nx) and
+            (K, nu), or one each, (chains, K, nx) and (chains, K, nu). They need not be feasible.
+        progress: called with (iterations done, of how many, diagnostics) every few iterations;
+            Ctrl-C between two calls ends the solve early and keeps what there is.
+        record: keep the knots of all chains every so many iterations, in `solution.recording`, for
+            `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
+            and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
+        devices: how many of this process to spread the chains over, evenly; the answer is the
+            same. Each compiles the program for itself, all at once.
+        checkpoint: a file to write every half minute, and to go on from where it is there, after
+            the same call was killed or ended by Ctrl-C. The answer is the same, bit for bit. A
+            file that belongs to a complete solve gives its answer again; it may be deleted.
+
+    Returns:
+        the solution with its certificate; look at `solution.certified`.
+
+    Raises:
+        DraxError: sizes that misfit; functions that cannot be differentiated, compute something
+            else each time, or are finite, with their derivatives, at no initial knot; a checkpoint
+            that cannot be written, is damaged or belongs to another solve.
+    """
+    problem = checked(problem)
+    if problem.dynamics.nx == 0:
+        raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
+    require_functions(progress=progress)
+    settings = settled(problem, chains, seed, solver)
+    recorder = None if record is None else Recorder(record)
+    search = Search(
+        Family.of_one(problem),
+        chains,
+        seed,
+        settings,
+        mesh=mesh_for(chains, devices),
+        guess=guess,
+        checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
+        recorder=recorder,
+        progress=progress,
+    )
+    solution = _certified(problem, settings, seed, search.run())
+    return solution if recorder is None else replace(solution, recording=recorder.recording())
+
+
+def _certified(problem: Problem, settings: Restarts, seed: int, found: Found) -> Solution:
+    """The solution: everything on the host, every chain replayed twice."""
+    state, info, records = found.chains.state, found.chains.info, found.records
+    trajectories = jax.tree.map(np.asarray, state.trajectory)
+    gains = np.asarray(state.gains)
+    if not settings.flow.preconditioner.has_gains:
+        shared, own = partition(Question(settings.flow, problem), None)
+        gains = np.asarray(feedback_gains(own, shared, state))
+    return Solution(
+        problem=problem,
+        solver=settings,
+        seed=seed,
+        trajectories=trajectories,
+        multipliers=jax.tree.map(np.asarray, state.multipliers),
+        gains=gains,
+        cost=np.asarray(info.cost),
+        max_defect=np.asarray(info.max_defect),
+        max_violation=np.asarray(info.max_violation),
+        converged_at=np.where(np.asarray(state.died_at) < 0, found.chains.feasible_since, -1),
+        died_at=np.asarray(state.died_at),
+        open_loop=replays(problem, trajectories, np.zeros_like(gains)),
+        feedback=replays(problem, trajectories, gains),
+        history={
+            "iteration": np.array([done for done, _ in records]),
+            "cost": np.stack([np.asarray(i.cost) for _, i in records]),
+            "max_defect": np.stack([np.asarray(i.max_defect) for _, i in records]),
+            "began": np.array([began for began, _ in found.began]),
+            "noise_ends": np.array([end for _, end in found.began]),
+        },
+        iterations=records[-1][0],
+        compile_time=found.compile_time,
+        solve_time=found.solve_time,
+        engine=problem.dynamics.engine,
+    )
