@@ -7,7 +7,7 @@ import pytest
 
 from mjx_drax import DraxError, from_function, from_mjcf, guesses
 from mjx_drax.physics.actuators import inverse_dynamics
-from mjx_drax.search.restarts import initial_knots
+from mjx_drax.search.initial import initial_knots
 
 ARM = """
 <mujoco model="arm">

@@ -11,7 +11,6 @@ import pytest
 
 from mjx_drax import DraxError, Trajectory, from_mjcf
 from mjx_drax.base.pytrees import with_host_fields
-from mjx_drax.search.iterate import evaluate
 from mjx_drax.method.model import linearize
 from mjx_drax.models import path
 from mjx_drax.physics import step as physics
@@ -19,6 +18,7 @@ from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.report import check
 from mjx_drax.physics.states import difference, set_state
 from mjx_drax.problem.differentiators import Autodiff
+from mjx_drax.search.iterate import evaluate
 
 MODELS = ["pendulum", "cartpole", "acrobot"]
 K = 8
