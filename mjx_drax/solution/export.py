@@ -1,6 +1,7 @@
-"""Exporters: each writes a solution into a file of one format. A user's own is a subclass.
+"""What writes a solution into a file of one format: a subclass of `Exporter`.
 
-Nothing heavy is imported here, so that the help of the command line lists exporters at once.
+Those of the library are in `view.exporters`. Nothing heavy is imported here or there, so that the
+help of the command line lists them at once.
 """
 
 from __future__ import annotations
@@ -50,57 +51,6 @@ class Exporter:
             DraxError: the file cannot be written.
         """
         raise NotImplementedError
-
-
-class Csv(Exporter):
-    """The best chain's replay as a table."""
-
-    name, file = "csv", "replay.csv"
-    summary = "times, states and controls of the replay as a table"
-
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the table; see `formats.save_csv`."""
-        from mjx_drax.solution.formats import save_csv
-
-        save_csv(solution, path)
-
-
-class Keyframes(Exporter):
-    """The best chain's replay as MJCF."""
-
-    name, file = "keyframes", "keyframes.xml"
-    summary = "the model with the replay as keyframes, for MuJoCo's viewers"
-
-    def check(self, problem: Problem) -> None:
-        """Complain about a problem without MJCF."""
-        from mjx_drax.solution.formats import mjcf_of
-
-        mjcf_of(problem)
-
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the model; see `formats.export_keyframes`."""
-        from mjx_drax.solution.formats import export_keyframes
-
-        export_keyframes(solution, path)
-
-
-class Dataset(Exporter):
-    """The certified chains as HDF5."""
-
-    name, file = "dataset", "dataset.h5"
-    summary = 'all certified chains as HDF5; pip install "mjx-drax[dataset]"'
-
-    def check(self, problem: Problem) -> None:
-        """Complain if h5py is not installed."""
-        from mjx_drax.solution.formats import require_h5py
-
-        require_h5py()
-
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the chains; see `formats.save_dataset`."""
-        from mjx_drax.solution.formats import save_dataset
-
-        save_dataset(solution, path)
 
 
 def exporters() -> dict[str, Exporter]:

@@ -1,8 +1,8 @@
 """A replay in the browser: one HTML file with everything in it, which opens from disk.
 
-viser records the scene: bodies are frames that move from knot to knot, their geoms are meshes that
-hang on them. The viewer that comes with the recording has a bar to scrub along time, and a scene
-tree, in which these parts are shown and hidden:
+viser records the scene: bodies are frames that move from knot to knot, and their geoms are meshes
+in these frames. The page has a bar to move along time, and a scene tree, in which these parts are
+shown and hidden:
 
     world    what does not move
     replay   the best chain, as its engine replayed it
@@ -10,7 +10,7 @@ tree, in which these parts are shown and hidden:
     ghosts   some knots of the plan at once, translucent
     path     of the geom that travels farthest, in the replay
 
-Tendons, skins and flexible bodies are left out; textures become their mean colour.
+Tendons, skins and flexible bodies are left out; textures become their mean color.
 """
 
 from __future__ import annotations
@@ -28,18 +28,20 @@ import numpy as np
 import numpy.typing as npt
 
 from mjx_drax.base.errors import DraxError, require_whole
-from mjx_drax.base.files import complete, require
-from mjx_drax.physics._mujoco import mujoco
-from mjx_drax.physics.states import finite, set_state
-from mjx_drax.solution.solution import OPEN_LOOP, TRACKED, Solution
-from mjx_drax.view.painter import Mesh, color, mesh_of, model_mesh, primitive
+from mjx_drax.base.files import complete, file_path, require
+from mjx_drax.physics.dynamics import mujoco_model
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.states import finite
+from mjx_drax.solution.replay import OPEN_LOOP, TRACKED
+from mjx_drax.solution.solution import Solution
+from mjx_drax.view.geoms import Floats, Surface, mean_color, surface_of
+from mjx_drax.view.scene import Scene, camera_for, posed
+from mjx_drax.view.video import outcome_lines
 
 if TYPE_CHECKING:
     import viser
 
     from mjx_drax.problem.problem import Problem
-
-Floats = npt.NDArray[np.floating[Any]]
 
 GHOSTS = 8
 """So many knots of the plan are shown at once."""
@@ -67,7 +69,7 @@ def require_viewer(problem: Problem) -> None:
     Raises:
         DraxError: viser is missing, or the problem has no model.
     """
-    if not hasattr(problem.dynamics, "mj_model"):
+    if mujoco_model(problem.dynamics) is None:
         raise DraxError(
             f"{problem.name} has no MuJoCo model to show in a browser, its dynamics are a "
             "function: see plot.png, or video.mp4 of tasks that draw themselves."
@@ -83,7 +85,7 @@ def save_html(solution: Solution, path: str | os.PathLike[str], ghosts: int = GH
     Args:
         solution: from `solve`, of a problem from MJCF.
         path: where to, ending in .html.
-        ghosts: number of knots of the plan that are shown at once, translucent.
+        ghosts: number of knots of the plan that are shown at once, as translucent robots.
 
     Raises:
         DraxError: viser is not installed, the problem has no model, a number of ghosts below 0, or
@@ -93,21 +95,13 @@ def save_html(solution: Solution, path: str | os.PathLike[str], ghosts: int = GH
     require_whole("ghosts", ghosts, 0)
     with complete(path, (".html", ".htm")) as partial:
         partial.write_text(_page(solution, _recorded(solution, int(ghosts))), encoding="utf-8")
-    return Path(path).expanduser()
+    return file_path(path)
 
 
 def _page(solution: Solution, recording: str) -> str:
     """The recording with a title and a few lines about the solution."""
-    chain, mode = solution.best_chain, solution.replay_mode
-    lines = [
-        solution.problem.name,
-        f"cost {solution.cost[chain]:.4g}, max|h| {solution.max_defect[chain]:.1g}",
-        f"{solution.engine}, {mode}:",
-        solution.outcome(mode),
-        "plan, ghosts and path: see the scene tree, below at the right",
-    ]
-    if not solution.certified:
-        lines.insert(1, "NOT CERTIFIED")
+    *lines, _ = outcome_lines(solution)  # without the time
+    lines.append("plan, ghosts and path: see the scene tree, below at the right")
     head = _BANNER.format(
         name=html.escape(f"{solution.problem.name}, replayed"),
         background="#0e1219d0" if solution.certified else "#961414e0",
@@ -138,16 +132,19 @@ def _server() -> Iterator[viser.ViserServer]:
 
 def _recorded(solution: Solution, ghosts: int) -> str:
     """The scene at all knots as viser's HTML."""
-    model = solution.problem.dynamics.mj_model  # type: ignore[attr-defined]
-    states = solution.replayed[0]
+    model = mujoco_model(solution.problem.dynamics)
+    assert model is not None  # as checked
+    states = finite(solution.replayed[0])
     plan = np.asarray(solution.problem.with_start(solution.best), float)
-    replayed, planned = _motion(model, states), _motion(model, plan)
+    replayed, planned = _motion(model, states), _motion(model, finite(plan))
     certificate = solution.certificate
     follows = certificate.open_loop if solution.replay_mode == OPEN_LOOP else certificate.feedback
     with _server() as server:
         scene = server.scene
-        shapes = _shapes(model, states[: len(replayed[0])], server)
-        _add_world(scene, shapes, model)
+        shapes = _shapes(model, states[:, : model.nq], server)
+        for shape in shapes:
+            if not shape.moves:
+                _add_shape(scene, f"/world/{shape.label}", shape, float(model.stat.extent))
         frames = _add_robot(scene, "replay", shapes, replayed, None)
         frames += _add_robot(scene, "plan", shapes, planned, _PLAN_COLOR)
         scene.add_frame("/plan", show_axes=False, visible=not follows["max_deviation"] < TRACKED)
@@ -168,23 +165,17 @@ Motion = tuple[Floats, Floats]
 
 
 def _motion(model: mujoco.MjModel, states: Floats) -> Motion:
-    """Where the bodies are, for states (K+1, nx) up to the first that is not finite."""
-    data = mujoco.MjData(model)
-    states = finite(states)
-    count = len(states)
-    positions, turns = np.empty((count, model.nbody, 3)), np.empty((count, model.nbody, 4))
-    for k, x in enumerate(states):
-        set_state(model, data, x)
-        mujoco.mj_kinematics(model, data)
-        positions[k], turns[k] = data.xpos, data.xquat
-    return positions, turns
+    """Where the bodies are in states (T, nx)."""
+    poses = [(d.xpos.copy(), d.xquat.copy()) for d in posed(model, states[:, : model.nq])]
+    positions, turns = zip(*poses, strict=True)
+    return np.array(positions), np.array(turns)
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """A visible geom or site: its body, pose in the frame of that body, surface and colour.
+    """A visible geom or site: its body, pose in the frame of that body, surface and color.
 
-    `mesh` is None for planes, whose half sides are `size`; a half side of 0 has no end. Surfaces
+    `surface` is None for planes, whose half sides are `size`; a half side of 0 has no end. Surfaces
     that may be open are drawn from both sides.
     """
 
@@ -193,75 +184,46 @@ class _Shape:
     moves: bool
     position: Floats
     wxyz: Floats
-    mesh: Mesh | None
+    surface: Surface | None
     size: Floats
     smooth: bool
     closed: bool
     rgba: Floats
 
 
-def _shapes(model: mujoco.MjModel, states: Floats, server: viser.ViserServer) -> list[_Shape]:
-    """What MuJoCo's viewer shows of the model; points the camera as films do."""
-    from mjx_drax.view import rendering
-
-    data = mujoco.MjData(model)
-    set_state(model, data, states[0])
-    mujoco.mj_forward(model, data)
-    scene = mujoco.MjvScene(model, maxgeom=10_000)
-    view = rendering.view_of(model, states[:, : model.nq], None, 16 / 9)
-    everything = mujoco.mjtCatBit.mjCAT_ALL.value
-    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, view, everything, scene)
-    _point_camera(server, scene, model)
+def _shapes(model: mujoco.MjModel, qpos: Floats, server: viser.ViserServer) -> list[_Shape]:
+    """What MuJoCo's viewer shows of the model; the page's camera is that of videos."""
+    drawn = Scene(model, camera_for(model, qpos, None, 16 / 9))
+    drawn.begin(qpos[0])
+    _point_camera(server, drawn.content, model)
+    bodies = {
+        int(_OBJECT.mjOBJ_GEOM): model.geom_bodyid,
+        int(_OBJECT.mjOBJ_SITE): model.site_bodyid,
+    }
     found: list[_Shape] = []
-    for geom in scene.geoms[: scene.ngeom]:
-        mesh = _surface(model, geom)
-        bodies = {
-            int(_OBJECT.mjOBJ_GEOM): model.geom_bodyid,
-            int(_OBJECT.mjOBJ_SITE): model.site_bodyid,
-        }
-        if geom.objtype not in bodies or (mesh is None and geom.type != _GEOM.mjGEOM_PLANE):
+    for geom in drawn.content.geoms[: drawn.content.ngeom]:
+        surface, rgba = surface_of(model, geom), mean_color(model, geom)
+        known = surface is not None or geom.type == _GEOM.mjGEOM_PLANE
+        if not known or geom.objtype not in bodies or rgba[3] == 0.0:
             continue
         body = int(bodies[geom.objtype][geom.objid])
-        turn = data.xmat[body].reshape(3, 3)
+        turn = drawn.data.xmat[body].reshape(3, 3)
         wxyz = np.empty(4)
         mujoco.mju_mat2Quat(wxyz, np.ravel(turn.T @ geom.mat.astype(float)))
-        found.append(
-            _Shape(
-                label=f"{len(found)}",
-                body=body,
-                moves=model.body_weldid[body] != 0,
-                position=turn.T @ (geom.pos - data.xpos[body]),
-                wxyz=wxyz,
-                mesh=mesh,
-                size=np.array(geom.size, float),
-                smooth=geom.type in _SMOOTH,
-                closed=geom.type not in (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_HFIELD),
-                rgba=color(model, geom),
-            )
+        shape = _Shape(
+            label=f"{len(found)}",
+            body=body,
+            moves=model.body_weldid[body] != 0,
+            position=turn.T @ (geom.pos - drawn.data.xpos[body]),
+            wxyz=wxyz,
+            surface=surface,
+            size=np.array(geom.size, float),
+            smooth=geom.type in _SMOOTH,
+            closed=geom.type not in (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_HFIELD),
+            rgba=rgba,
         )
-    return [shape for shape in found if shape.rgba[3] > 0.0]
-
-
-def _surface(model: mujoco.MjModel, geom: mujoco.MjvGeom) -> Mesh | None:
-    """The geom's surface in its own frame, or None."""
-    if geom.type == _GEOM.mjGEOM_MESH:
-        return model_mesh(model, mesh_of(geom))
-    if geom.type == _GEOM.mjGEOM_HFIELD:
-        return _terrain(model, int(geom.dataid))
-    return primitive(model, geom)
-
-
-def _terrain(model: mujoco.MjModel, index: int) -> Mesh:
-    """The upper side of a height field."""
-    rows, columns = int(model.hfield_nrow[index]), int(model.hfield_ncol[index])
-    start = int(model.hfield_adr[index])
-    x_half, y_half, height, _ = model.hfield_size[index]
-    heights = height * model.hfield_data[start : start + rows * columns].astype(float)
-    x, y = np.meshgrid(np.linspace(-x_half, x_half, columns), np.linspace(-y_half, y_half, rows))
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
-    corner = (row * columns + column).ravel()
-    faces = np.stack([corner, corner + 1, corner + columns + 1, corner + columns], axis=-1)
-    return Mesh(np.stack([x.ravel(), y.ravel(), heights], axis=-1), faces)
+        found.append(shape)
+    return found
 
 
 def _point_camera(server: viser.ViserServer, scene: mujoco.MjvScene, model: mujoco.MjModel) -> None:
@@ -271,13 +233,6 @@ def _point_camera(server: viser.ViserServer, scene: mujoco.MjvScene, model: mujo
     start = server.initial_camera
     start.position, start.look_at = position, position + distance * forward
     start.fov = 2.0 * float(np.arctan(camera.frustum_top / camera.frustum_near))
-
-
-def _add_world(scene: viser.SceneApi, shapes: list[_Shape], model: mujoco.MjModel) -> None:
-    extent = float(model.stat.extent)
-    for shape in shapes:
-        if not shape.moves:
-            _add_shape(scene, f"/world/{shape.label}", shape, extent)
 
 
 def _add_robot(
@@ -307,7 +262,7 @@ def _add_shape(
     rgb, opacity, scale = shape.rgba[:3], float(shape.rgba[3]), 1.0
     if tint is not None:
         rgb, opacity, scale = tint, opacity * _PLAN_OPACITY, _PLAN_SCALE
-    if shape.mesh is None:
+    if shape.surface is None:
         width, height = np.where(shape.size[:2] > 0.0, 2.0 * shape.size[:2], _FLOOR * extent)
         cell = float(10.0 ** np.round(np.log10(extent / 4.0)))
         scene.add_grid(
@@ -325,7 +280,7 @@ def _add_shape(
             wxyz=shape.wxyz,
         )
         return
-    vertices, faces = _triangles(shape.mesh)
+    vertices, faces = _triangles(shape.surface)
     scene.add_mesh_simple(
         name,
         vertices,
@@ -345,10 +300,10 @@ def _add_ghosts(scene: viser.SceneApi, shapes: list[_Shape], plan: Motion, count
     knots = np.unique(np.linspace(0, len(plan[0]) - 1, count).round().astype(int))
     scene.add_frame("/ghosts", show_axes=False)
     for shape in shapes:
-        if not shape.moves or shape.mesh is None or not len(knots):
+        if not shape.moves or shape.surface is None or not len(knots):
             continue
         positions, turns = _placed(shape, (plan[0][knots], plan[1][knots]))
-        vertices, faces = _triangles(shape.mesh)
+        vertices, faces = _triangles(shape.surface)
         scene.add_batched_meshes_simple(
             f"/ghosts/{shape.label}",
             vertices,
@@ -381,12 +336,12 @@ def _placed(shape: _Shape, motion: Motion) -> Motion:
     return positions, turns
 
 
-def _triangles(mesh: Mesh) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
+def _triangles(surface: Surface) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
     """Vertices (V, 3) and faces (F, 3), quadrangles cut in two."""
-    faces = mesh.faces
+    faces = surface.faces
     if faces.shape[1] == 4:
         faces = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-    return mesh.vertices.astype(np.float32), faces.astype(np.uint32)
+    return surface.vertices.astype(np.float32), faces.astype(np.uint32)
 
 
 def _bytes(rgb: Floats) -> tuple[int, int, int]:

@@ -1,7 +1,7 @@
-"""One picture of a solution: the motion, how the chains got there, and where they ended.
+"""Plots of a solution: the motion, how the chains got there, where they ended; and its optima.
 
 Colors are those of Okabe and Ito, which colour-blind readers tell apart; markers and dashes say the
-same without colour. Figures are drawn by matplotlib's Agg objects: no display, no global state.
+same without color. Figures are drawn by matplotlib's Agg objects: no display, no global state.
 """
 
 from __future__ import annotations
@@ -23,17 +23,19 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path
-from mjx_drax.method.langevin import FEASIBLE
 from mjx_drax.physics.states import finite
-from mjx_drax.solution.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
+from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
+from mjx_drax.solution.solution import Solution
+from mjx_drax.view.labels import control_labels, state_groups
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mjx_drax.problem.dynamics import Dynamics
     from mjx_drax.solution.optima import Optimum
+    from mjx_drax.view.drawing import Draw
 
-    Draw = Callable[[Axes, np.ndarray], None]
+    Panel = Callable[[Axes], None]
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GRAY = "#0072B2", "#D55E00", "#CC79A7", "#767676"
@@ -42,9 +44,10 @@ CURVES = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY)
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 
 DPI = 150
-COLUMNS = 2
 MAPS, PANELS = 9, 12
-"""Most panels of `plot_optima`: optima on maps, coordinates of states."""
+"""Most panels of a figure: optima as the task draws them, coordinates."""
+
+_LEAST_WIDTH, _TITLE_HEIGHT = 5.2, 0.8  # of figures, and of the space for their titles [inches]
 
 
 def plot_solution(
@@ -63,24 +66,17 @@ def plot_solution(
     Raises:
         DraxError: the path cannot be written.
     """
-    panels: list[Callable[[Axes], None]] = []
+    times, mode = solution.problem.times, solution.replay_mode
+    panels: list[Panel] = []
     if draw is not None:
         panels.append(partial(_draw_scene, solution=solution, draw=draw))
-    times, mode = solution.problem.times, solution.replay_mode
     panels += [partial(curves.draw, times=times, mode=mode) for curves in _motion(solution)]
     panels += [
-        partial(_draw_defects, solution=solution),
-        partial(_draw_costs, solution=solution),
-        partial(_draw_chains, solution=solution),
+        partial(draw_chains, solution=solution)
+        for draw_chains in (_draw_defects, _draw_costs, _draw_final_costs)
     ]
-    rows = -(-len(panels) // COLUMNS)
-    figure = Figure((4.0 * COLUMNS, 2.6 * rows + 0.8), DPI, layout="constrained", facecolor="white")
-    grid = figure.add_gridspec(rows, COLUMNS)
-    for i, panel in enumerate(panels):
-        row, column = divmod(i, COLUMNS)
-        last = COLUMNS if i == len(panels) - 1 else column + 1  # the last one fills its row
-        panel(figure.add_subplot(grid[row, column:last]))
     color = BLACK if solution.certified else VERMILLION
+    figure = panel_figure(panels, 2, (4.0, 2.6), fill=True)
     figure.suptitle(_title(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
     return save_figure(figure, path)
 
@@ -106,39 +102,58 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
             f"{solution.problem.name} has no optima to draw: no chain is certified. See "
             "solution.certificate."
         )
-    panels: list[Callable[[Axes], None]]
+    panels: list[Panel]
     if draw is not None:
         shown = found[:MAPS]
         panels = [
             partial(_draw_map, rank=rank, optimum=optimum, draw=draw)
             for rank, optimum in enumerate(shown, 1)
         ]
-        columns, size = min(3, len(panels)), (3.0, 3.2)
+        figure = panel_figure(panels, 3, (3.0, 3.2))
     else:
-        shown = found[: len(CURVES)]
-        groups = _state_groups(solution.problem.dynamics)
-        named = sorted(pair for _, names in groups for pair in names.items())
-        labels = [label for _, label in named]
+        shown, times = found[: len(CURVES)], solution.problem.times
+        kinds = state_groups(solution.problem.dynamics).values()
+        labels = sorted(pair for labels in kinds for pair in labels.items())
         panels = [
-            partial(_draw_ways, optima=shown, column=i, label=label, times=solution.problem.times)
-            for i, label in enumerate(labels[:PANELS])
+            partial(_draw_column, optima=shown, column=column, label=label, times=times)
+            for column, label in labels[:PANELS]
         ]
-        columns, size = min(COLUMNS, len(panels)), (4.0, 2.6)
-    rows = -(-len(panels) // columns)
-    inches = (max(size[0] * columns, 5.0), size[1] * rows + 0.8)
-    figure = Figure(inches, DPI, layout="constrained", facecolor="white")
-    for i, panel in enumerate(panels, 1):
-        panel(figure.add_subplot(rows, columns, i))
-    if draw is None:
-        names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*names, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+        figure = panel_figure(panels, 2, (4.0, 2.6), legend=3)
     drawn = "" if len(shown) == len(found) else f", the cheapest {len(shown)}"
-    figure.suptitle(
-        f"{solution.problem.name}: {len(found)} distinct optima{drawn}, as replayed",
-        fontsize=9,
-        parse_math=False,
-    )
+    title = f"{solution.problem.name}: {len(found)} distinct optima{drawn}, as replayed"
+    figure.suptitle(title, fontsize=9, parse_math=False)
     return save_figure(figure, path)
+
+
+def panel_figure(
+    panels: Sequence[Panel],
+    columns: int,
+    size: tuple[float, float],
+    legend: int = 0,
+    fill: bool = False,
+) -> Figure:
+    """A figure with panels row by row.
+
+    Args:
+        panels: each draws on the axes that it is given.
+        columns: number of them at the most.
+        size: (width, height) of a panel [inches].
+        legend: number of columns in a legend below, which explains the first panel; 0 for none.
+        fill: whether the last panel fills its row.
+    """
+    columns = min(columns, len(panels))
+    rows = -(-len(panels) // columns)
+    inches = (max(size[0] * columns, _LEAST_WIDTH), size[1] * rows + _TITLE_HEIGHT)
+    figure = Figure(inches, DPI, layout="constrained", facecolor="white")
+    grid = figure.add_gridspec(rows, columns)
+    for i, panel in enumerate(panels):
+        row, column = divmod(i, columns)
+        end = columns if fill and i == len(panels) - 1 else column + 1
+        panel(figure.add_subplot(grid[row, column:end]))
+    if legend:
+        names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*names, loc="outside lower center", ncols=legend, fontsize=7, frameon=False)
+    return figure
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
@@ -193,7 +208,7 @@ def _draw_map(axes: Axes, rank: int, optimum: Optimum, draw: Draw) -> None:
     axes.tick_params(labelsize=7)
 
 
-def _draw_ways(
+def _draw_column(
     axes: Axes, optima: Sequence[Optimum], column: int, label: str, times: np.ndarray
 ) -> None:
     """One coordinate of the state over time, a curve for every optimum; the cheapest on top."""
@@ -266,51 +281,12 @@ def _motion(solution: Solution) -> list[Curves]:
         np.vstack([side.x[:1], side.x]).astype(float) for side in problem.bounds.sides(best)
     )
     groups = []
-    for title, names in _state_groups(solution.problem.dynamics):
-        arrays = (a[:, list(names)] for a in (plan, states, lower, upper))
-        groups += Curves(title, list(names.values()), *arrays).parts()
+    for kind, labels in state_groups(problem.dynamics).items():
+        arrays = (a[:, list(labels)] for a in (plan, states, lower, upper))
+        groups += Curves(kind, list(labels.values()), *arrays).parts()
     limits = (np.asarray(side.u) for side in problem.bounds.sides(best))
-    labels = _control_labels(problem.dynamics)
-    return groups + Curves("controls", labels, np.asarray(best.u), controls, *limits).parts()
-
-
-def _state_groups(dynamics: Dynamics) -> list[tuple[str, dict[int, str]]]:
-    """Titles of groups of states, with the columns that belong to them and their names."""
-    model = getattr(dynamics, "mj_model", None)
-    if model is None:
-        return [("states", {i: f"x[{i}]" for i in range(dynamics.nx)})]
-    positions: dict[int, str] = {}
-    quaternions: dict[int, str] = {}
-    velocities: dict[int, str] = {}
-    for j in range(model.njnt):
-        name, kind = model.joint(j).name or f"joint {j}", int(model.jnt_type[j])
-        q, v = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
-        if kind in (2, 3):  # slide, hinge
-            unit = {2: "m", 3: "rad"}[kind]
-            positions[q], velocities[v] = f"{name} [{unit}]", f"{name} [{unit}/s]"
-            continue
-        if kind == 0:  # free: a place, then what a ball has
-            positions |= {q + i: f"{name} {axis} [m]" for i, axis in enumerate("xyz")}
-            velocities |= {v + i: f"{name} {axis} [m/s]" for i, axis in enumerate("xyz")}
-            q, v = q + 3, v + 3
-        quaternions |= {q + i: f"{name} q{part}" for i, part in enumerate("wxyz")}
-        velocities |= {v + i: f"{name} turn {axis} [rad/s]" for i, axis in enumerate("xyz")}
-    first = model.nq + model.nv
-    activations = {first + i: f"act[{i}]" for i in range(model.na)}
-    groups = {
-        "positions": positions,
-        "orientations": quaternions,
-        "velocities": velocities,
-        "activations": activations,
-    }
-    return [(title, names) for title, names in groups.items() if names]
-
-
-def _control_labels(dynamics: Dynamics) -> list[str]:
-    model = getattr(dynamics, "mj_model", None)
-    if model is None:
-        return [f"u[{i}]" for i in range(dynamics.nu)]
-    return [model.actuator(i).name or f"actuator {i}" for i in range(dynamics.nu)]
+    labels_u = control_labels(problem.dynamics)
+    return groups + Curves("controls", labels_u, np.asarray(best.u), controls, *limits).parts()
 
 
 def _limits(
@@ -374,7 +350,7 @@ def _draw_costs(axes: Axes, solution: Solution) -> None:
     label_panel(axes, f"cost of feasible chains{nothing}", "iteration", handles)
 
 
-def _draw_chains(axes: Axes, solution: Solution) -> None:
+def _draw_final_costs(axes: Axes, solution: Solution) -> None:
     """Final costs in rising order; what is infeasible may undercut the optimum."""
     cost = np.asarray(solution.cost, float)
     rank = np.empty(len(cost), int)

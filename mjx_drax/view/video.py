@@ -1,193 +1,250 @@
-"""Frames with text on them, and films made of frames: .mp4, or .gif and .webp for web pages."""
+"""Videos of solutions and motions, made without a display.
+
+Models are drawn by OpenGL, or by numpy where there is none (see `renderer`); problems without a
+model by a function that the task brings, on matplotlib axes.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
 import os
-from collections.abc import Generator, Iterable, Sequence
-from functools import lru_cache
-from itertools import pairwise
+from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from mjx_drax.base.errors import DraxError, shown
-from mjx_drax.base.files import complete, file_path
+from mjx_drax.base.errors import DraxError, require_positive, shown
+from mjx_drax.physics.dynamics import mujoco_model
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.states import finite, interpolated
+from mjx_drax.view.drawing import Canvas, knot_at
+from mjx_drax.view.frames import UNCERTIFIED, Frame, captioned, even_size, text_box, write
+from mjx_drax.view.geoms import Floats
+from mjx_drax.view.renderer import open_renderer
+from mjx_drax.view.scene import Scene, camera_for
 
 if TYPE_CHECKING:
-    from PIL import Image, ImageFont
+    from mjx_drax.problem.problem import Problem
+    from mjx_drax.solution.solution import Solution
+    from mjx_drax.view.drawing import Draw
 
-Frame = npt.NDArray[np.uint8]
-
-UNCERTIFIED = "NOT CERTIFIED"
-"""These words in a caption turn its box red."""
-
-SUFFIXES = (".mp4", ".gif", ".webp")
-
-_CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
-_WEBP_QUALITY = 60
+_HOLD = 0.5  # [s] the last frame stays this long
 
 
-def write(
+def render(
+    solution: Solution,
     path: str | os.PathLike[str],
-    frames: Generator[Frame, None, None],
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+    draw: Draw | None = None,
+) -> Path:
+    """Films the best chain's motion as it was replayed, not as it was planned; returns the path.
+
+    Cost, max|h| and the replay's outcome stand in the picture. A replay that turns non-finite is
+    shown up to there.
+
+    Args:
+      solution: from `solve`.
+      path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
+      fps: frames per second.
+      size: (height, width) [pixels].
+      camera: a camera of the model, see `render_frames`.
+      speed: of the motion; 0.5 is slow motion.
+      draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
+        for problems without a model (others do not use it).
+
+    Raises:
+      DraxError: a path, size, fps, speed or camera that cannot be used, or neither a model nor
+        `draw`.
+    """
+    check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
+    states = finite(solution.replayed[0])
+    times, overlay = solution.problem.times[: len(states)], outcome_lines(solution)
+    model = mujoco_model(solution.problem.dynamics)
+    if model is not None:
+        frames = _frames(model, states[:, : model.nq], times, overlay, fps, size, camera, speed)
+    else:
+        assert draw is not None  # as checked
+        frames = _drawn_frames(draw, states, times, overlay, fps, size, speed)
+    return write(path, frames, fps)
+
+
+def check(
+    problem: Problem,
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+    draw: Draw | None = None,
+) -> None:
+    """Complain before a solve about what `render` would refuse after it.
+
+    Raises:
+      DraxError: a size, fps, speed or camera that cannot be used, or neither a model nor `draw`.
+    """
+    frame_times(np.zeros(1), fps, speed)
+    even_size(size)
+    model = mujoco_model(problem.dynamics)
+    if model is not None:
+        camera_for(model, model.qpos0[None], camera, 1.0)
+    elif draw is None:
+        raise DraxError(
+            f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
+            "draws states x_0..x_k (k + 1, nx) on matplotlib axes (see tasks/bug_trap.py)."
+        )
+
+
+def render_motion(
+    model: mujoco.MjModel,
+    qpos: npt.ArrayLike,
+    times: npt.ArrayLike,
+    path: str | os.PathLike[str],
+    *,
+    overlay: Sequence[str] = (),
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+) -> Path:
+    """Films a motion as an H.264 mp4 that browsers play, or as .gif or .webp; returns the path.
+
+    The arguments are those of `render_frames`; the path's folder is made if need be. The file
+    appears once it is complete. Raises DraxError before anything is drawn.
+    """
+    return write(path, _frames(model, qpos, times, overlay, fps, size, camera, speed), fps)
+
+
+def render_frames(
+    model: mujoco.MjModel,
+    qpos: npt.ArrayLike,
+    times: npt.ArrayLike,
+    *,
+    overlay: Sequence[str] = (),
+    fps: float = 30.0,
+    size: tuple[int, int] = (480, 640),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+) -> Frame:
+    """Frames (N, height, width, 3) uint8 of a motion, the last one held for half a second.
+
+    Args:
+      model: what moves.
+      qpos: positions (T, nq), interpolated between their times (along geodesics for quaternions).
+      times: when they are reached (T,) [s], not decreasing.
+      overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
+      fps: frames per second.
+      size: (height, width) [pixels]; odd ones are made even, which players ask for.
+      camera: a camera's name or index; "free" is one that sees the whole motion. None takes the
+        one called "main", or, in a model without one, the free one.
+      speed: of the motion; 0.5 is slow motion.
+
+    Raises:
+      DraxError: positions of the wrong shape or not finite, decreasing times, unknown camera.
+    """
+    return np.stack(list(_frames(model, qpos, times, overlay, fps, size, camera, speed)))
+
+
+def outcome_lines(solution: Solution) -> list[str]:
+    """Lines of text about the best chain, short ones, which leave the robot in view."""
+    chain, mode = solution.best_chain, solution.replay_mode
+    cost, defect, violation = (
+        float(a[chain]) for a in (solution.cost, solution.max_defect, solution.max_violation)
+    )
+    has_model = mujoco_model(solution.problem.dynamics) is not None
+    lines = [
+        solution.problem.name,
+        f"cost {cost:.3g}   max|h| {defect:.1g}",
+        f"bound violation {violation:.1g}",
+        f"{'MuJoCo C replay' if has_model else 'float64 rollout'}, {mode}:",
+        solution.outcome(mode),
+        "t = {time}",
+    ]
+    if not solution.certified:
+        infeasible = "the plan breaks the dynamics"
+        reason = "no replay succeeds" if solution.feasible[chain] else infeasible
+        lines.insert(1, f"{UNCERTIFIED}: {reason}")
+    return lines
+
+
+def frame_times(times: Floats, fps: float, speed: float = 1.0) -> Floats:
+    """When frames are taken of a motion between times (T,) [s]; its end is held."""
+    require_positive("fps", fps)
+    require_positive("speed", speed)
+    step = speed / fps
+    count = int((times[-1] - times[0]) / step + 1e-6) + 1
+    moving = times[0] + np.arange(count) * step
+    return np.append(moving, np.full(round(_HOLD * fps), times[-1]))
+
+
+def _frames(
+    model: mujoco.MjModel,
+    qpos: npt.ArrayLike,
+    times: npt.ArrayLike,
+    overlay: Sequence[str],
     fps: float,
     size: tuple[int, int],
-) -> Path:
-    """Writes frames of a size, rounded up to even; returns the path.
+    camera: str | int | None,
+    speed: float,
+) -> Generator[Frame, None, None]:
+    """Checks everything now, draws one frame at a time later."""
+    positions, knot_times = _checked_motion(model, qpos, times)
+    moments = frame_times(knot_times, fps, speed)
+    if isinstance(overlay, str):
+        raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
+    height, width = even_size(size)
+    seen_by = camera_for(model, positions, camera, width / height)
 
-    Its suffix decides: .mp4 (H.264, which browsers play), .gif or .webp (which loop). The file
-    appears once it is complete.
+    def draw() -> Generator[Frame, None, None]:
+        scene = Scene(model, seen_by)
+        with open_renderer(model, height, width) as renderer:
+            for time in moments:
+                scene.begin(interpolated(model, positions, knot_times, time))
+                yield captioned(renderer.render(scene.content), overlay, time)
 
-    Raises:
-      DraxError: before any frame is drawn, a suffix or folder that cannot be used.
-    """
-    target = film_path(path)
-    with contextlib.closing(frames), complete(target) as partial:
-        partial.touch()  # complains before the first frame
-        if target.suffix.lower() == ".mp4":
-            _encode(partial, frames, fps, size)
-        else:
-            _animate(partial, frames, fps)
-    return target
-
-
-def _encode(path: Path, frames: Iterable[Frame], fps: float, size: tuple[int, int]) -> None:
-    import imageio_ffmpeg
-    import mediapy
-
-    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())  # so that pip alone is enough
-    with mediapy.VideoWriter(
-        path, even(size), fps=fps, crf=_CRF, ffmpeg_args=("-movflags", "+faststart")
-    ) as writer:
-        for frame in frames:
-            writer.add_image(frame)
+    return draw()
 
 
-def _animate(path: Path, frames: Iterable[Frame], fps: float) -> None:
-    from PIL import Image
-
-    images: list[Image.Image] = [Image.fromarray(frame) for frame in frames]
-    gif = path.suffix.lower() == ".gif"
-    unit = 10 if gif else 1  # [ms] what the format counts time in
-    ends = [unit * round(1000 * i / (fps * unit)) for i in range(len(images) + 1)]
-    durations = [max(unit, b - a) for a, b in pairwise(ends)]
-    options: dict[str, Any] = {"quality": _WEBP_QUALITY, "method": 4}
-    if gif:
-        images, options = _with_palette(images), {"optimize": False, "disposal": 1}
-    images[0].save(
-        path, save_all=True, append_images=images[1:], duration=durations, loop=0, **options
-    )
-
-
-def _with_palette(images: list[Image.Image]) -> list[Image.Image]:
-    """The images in 256 colors that are good for all of them; what stands still stays the same."""
-    from PIL import Image
-
-    few = images[:: max(1, len(images) // 8)]
-    width, height = images[0].size
-    sheet = Image.new("RGB", (width, height * len(few)))
-    for row, image in enumerate(few):
-        sheet.paste(image, (0, row * height))
-    palette = sheet.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    return [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+def _drawn_frames(
+    draw: Draw,
+    states: np.ndarray,
+    times: np.ndarray,
+    overlay: Sequence[str],
+    fps: float,
+    size: tuple[int, int],
+    speed: float,
+) -> Generator[Frame, None, None]:
+    """Frames of states (T, nx), drawn again at each knot, below the overlay."""
+    height, width = even_size(size)
+    top = text_box(overlay, height, width)[1][3] / height
+    canvas, drawn = Canvas.within(height, width, top=top), -1
+    for time in frame_times(times, fps, speed):
+        knot = knot_at(times, time)
+        if knot != drawn:
+            canvas.figure.clear()
+            draw(canvas.figure.add_subplot(), states[: knot + 1])
+            canvas.agg.draw()
+            drawn = knot
+        yield captioned(canvas.pixels(), overlay, time)
 
 
-def even(size: tuple[int, int]) -> tuple[int, int]:
-    """The size, rounded up to even numbers: yuv420p halves both sides."""
-    try:
-        height, width = (int(side) for side in size)
-    except (TypeError, ValueError, OverflowError):
-        height = width = 0
-    if isinstance(size, str) or not (16 <= height <= 8192 and 16 <= width <= 8192):
+def _checked_motion(
+    model: mujoco.MjModel, qpos: npt.ArrayLike, times: npt.ArrayLike
+) -> tuple[Floats, Floats]:
+    positions, knot_times = np.asarray(qpos, float), np.asarray(times, float)
+    if positions.ndim != 2 or positions.shape[1] != model.nq or len(positions) == 0:
         raise DraxError(
-            f"size is {shown(size)}: give (height, width), both within 16 and 8192 pixels."
+            f"qpos must have the shape (T, nq) = (T, {model.nq}), not {positions.shape}"
         )
-    return height + height % 2, width + width % 2
-
-
-def film_path(path: str | os.PathLike[str], suffixes: Sequence[str] = SUFFIXES) -> Path:
-    """The path of a film or picture, its folder made if need be.
-
-    Raises:
-      DraxError: another suffix, a folder in its place, or none that it can lie in.
-    """
-    target = file_path(path)
-    if target.suffix.lower() not in suffixes:
-        known = " or ".join(suffixes)
-        raise DraxError(f"this is written as {known}, not {target.name!r}: change the name.")
-    if target.is_dir():
-        raise DraxError(f"cannot write {target}: it is a folder; give a file in it.")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DraxError(
-            f"cannot write {target}: {error.strerror or error}; choose another place."
-        ) from error
-    return target
-
-
-def captioned(frame: Frame, lines: Sequence[str], time: float) -> Frame:
-    """The frame with lines of text in a translucent box at its top left."""
-    if not lines:
-        return frame
-    from PIL import Image, ImageDraw
-
-    height, width = frame.shape[:2]
-    font, box = text_box(lines, height, width)
-    text = "\n".join(lines).replace("{time}", f"{time:.2f} s")
-    image = Image.fromarray(frame)
-    draw = ImageDraw.Draw(image, "RGBA")
-    margin = height // 40
-    fill = (150, 20, 20, 210) if UNCERTIFIED in text else (14, 18, 25, 185)
-    draw.rounded_rectangle(box, radius=margin // 2, fill=fill)
-    corner = (2 * margin, 2 * margin)
-    draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
-    return np.asarray(image)
-
-
-def text_box(
-    lines: Sequence[str], height: int, width: int
-) -> tuple[ImageFont.FreeTypeFont, tuple[float, float, float, float]]:
-    """The font, and the box (left, top, right, bottom) around the text with its margin."""
-    from PIL import Image, ImageDraw
-
-    text = "\n".join(lines).replace("{time}", "00.00 s")
-    font = _fitted_font(text, height, width)
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    corner = (2 * margin, 2 * margin)
-    left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
-    return font, (left - margin, top - margin, right + margin, bottom + margin)
-
-
-@lru_cache(maxsize=16)
-def _fitted_font(text: str, height: int, width: int) -> ImageFont.FreeTypeFont:
-    """The largest font, up to 1/28 of the height, with which the text fits the frame."""
-    from PIL import Image, ImageDraw
-
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    for size in range(max(9, height // 28), 8, -1):
-        font = _font(size)
-        box = draw.multiline_textbbox((0, 0), text, font, spacing=margin // 2)
-        if box[2] <= width - 4 * margin and box[3] <= height - 4 * margin:
-            break
-    return font
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans (it has mathematical signs), which matplotlib brings; else Pillow's own."""
-    from PIL import ImageFont
-
-    found = importlib.util.find_spec("matplotlib")  # located, not imported: that takes a second
-    if found is not None and found.origin is not None:
-        path = Path(found.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"
-        if path.exists():
-            return ImageFont.truetype(str(path), size)
-    font = ImageFont.load_default(size)
-    assert isinstance(font, ImageFont.FreeTypeFont)
-    return font
+    if knot_times.shape != (len(positions),):
+        raise DraxError(f"times must have the shape ({len(positions)},), not {knot_times.shape}")
+    if not np.all(np.isfinite(positions)):
+        row = int(np.argmin(np.isfinite(positions).all(axis=1)))
+        raise DraxError(f"qpos must be finite; row {row} is {positions[row]}")
+    if not np.all(np.isfinite(knot_times)) or np.any(np.diff(knot_times) < 0.0):
+        raise DraxError("times must be finite and must not decrease")
+    return positions, knot_times

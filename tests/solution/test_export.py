@@ -1,4 +1,4 @@
-"""What is handed on is what was replayed, under names that others know."""
+"""Files for other programs hold what was replayed; exporters of the user's own are like others."""
 
 import csv
 from dataclasses import replace
@@ -7,9 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, export_keyframes, from_mjcf, save_csv, save_dataset
+from mjx_drax import DraxError, Exporter, export_keyframes, from_mjcf, save_csv, save_dataset
 from mjx_drax.base.files import complete, require
-from mjx_drax.solution.export import control_names, require_mjcf, state_names
+from mjx_drax.physics.dynamics import mujoco_model
+from mjx_drax.solution.export import NothingToExport, exporter, exporters
+from mjx_drax.solution.formats import control_names, mjcf_of, state_names
 from mjx_drax.tasks import load
 
 SPACE = """
@@ -28,8 +30,8 @@ SPACE = """
 
 
 def test_names_say_joint_and_actuator(slider):
-    model = mujoco.MjModel.from_xml_string(SPACE)
-    dynamics = type("Dynamics", (), {"mj_model": model, "nx": 27, "nu": 2})
+    dynamics = from_mjcf(SPACE, horizon=0.1, running_residual=lambda data, u: u).dynamics
+    model = mujoco_model(dynamics)
     names = state_names(dynamics)
     assert names[:8] == [
         *(f"qpos_root_{p}" for p in ("x", "y", "z", "qw", "qx", "qy", "qz")),
@@ -65,27 +67,26 @@ def test_keyframes_hold_the_replay_and_the_model_finds_its_meshes(slider, tmp_pa
     np.testing.assert_allclose(model.key_qvel[1:], states[:, 1:], rtol=1e-15)
     np.testing.assert_allclose(model.key_ctrl[1:-1], controls, rtol=1e-15)
     np.testing.assert_allclose(model.key_time[1:], slider.problem.times)
-    before = slider.problem.dynamics.mj_model
+    before = mujoco_model(slider.problem.dynamics)
     np.testing.assert_allclose(model.mesh_vert, before.mesh_vert)
     np.testing.assert_allclose(model.body_mass, before.body_mass, rtol=1e-5)
 
 
 def test_models_without_mjcf_have_no_keyframes(slider, tmp_path):
     with pytest.raises(DraxError, match="bug_trap has no MuJoCo model to write keyframes of"):
-        require_mjcf(load("bug_trap").make())
-    dynamics = slider.problem.dynamics
-    unknown = replace(dynamics, origin=None)
+        mjcf_of(load("bug_trap").make())
+    unknown = replace(slider.problem.dynamics, origin=None)
     with pytest.raises(DraxError, match=r"was given as a mujoco\.MjModel"):
-        require_mjcf(replace(slider.problem, dynamics=unknown))
+        mjcf_of(replace(slider.problem, dynamics=unknown))
     (tmp_path / "r.xml").write_text(SPACE)
     problem = from_mjcf(tmp_path / "r.xml", horizon=0.1, running_residual=lambda data, u: u)
-    require_mjcf(problem)
+    mjcf_of(problem)
     (tmp_path / "r.xml").write_text(SPACE.replace("0.1", "0.2"))
     with pytest.raises(DraxError, match=r"r.xml cannot be read again: it has changed since"):
-        require_mjcf(problem)
+        mjcf_of(problem)
     (tmp_path / "r.xml").unlink()
     with pytest.raises(DraxError, match=r"r.xml cannot be read again"):
-        require_mjcf(problem)
+        mjcf_of(problem)
 
 
 def test_a_dataset_holds_certified_trajectories_only(slider, tmp_path):
@@ -108,11 +109,60 @@ def test_a_dataset_holds_certified_trajectories_only(slider, tmp_path):
         assert first["max_deviation"][best] == slider.certificate.open_loop["max_deviation"]
         assert (np.diff(first["cost"]) >= 0).all()
     hopeless = replace(slider, max_defect=np.ones(4))
-    with pytest.raises(DraxError, match="no chain is certified, so the dataset would be empty"):
+    with pytest.raises(NothingToExport, match="no chain is certified, so the dataset would be"):
         save_dataset(hopeless, tmp_path / "none.h5")
     assert not (tmp_path / "none.h5").exists()
     with h5py.File(save_dataset(hopeless, tmp_path / "all.h5", everything=True)) as file:
         assert not file["000_slider"]["feasible"][:].any()
+
+
+class Markdown(Exporter):
+    name, file = "markdown", "replay.md"
+    summary = "times and states of the replay as a table in Markdown"
+
+    def write(self, solution, path):
+        rows = zip(solution.problem.times, solution.replayed[0], strict=True)
+        with complete(path, (".md",)) as partial:
+            partial.write_text("".join(f"| {time:g} | {x} |\n" for time, x in rows))
+
+
+def test_an_exporter_of_the_users_own_is_like_the_others(slider, tmp_path):
+    mine = exporters()["markdown"]
+    assert (mine.file, type(mine)) == ("replay.md", Markdown)
+    assert type(exporter("markdown")) is type(exporter(f"{__name__}:Markdown")) is Markdown
+    mine.check(slider.problem)
+    mine.write(slider, tmp_path / "new" / mine.file)
+    rows = (tmp_path / "new" / "replay.md").read_text().splitlines()
+    assert len(rows) == 26
+    assert rows[0].startswith("| 0 | [0.05 ")
+
+
+def test_an_exporter_from_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_exporters.py").write_text(
+        "from mjx_drax import Exporter\n"
+        "class Own(Exporter):\n"
+        "    file = 'own.txt'\n"
+        "    def write(self, solution, path): path.touch()\n"
+        "class Base(Exporter): pass\n"
+        "class Choosy(Own):\n"
+        "    def __init__(self, kind): self.kind = kind\n"
+        "LIST = []\n"
+    )
+    (tmp_path / "my_broken.py").write_text("1 / 0\n")
+    assert exporter("my_exporters:Own").file == "own.txt"
+    for text, words in {
+        "own": "there is no exporter 'own': give one of .*markdown",
+        "my_exporters:": "there is no exporter",
+        "my_absent:Own": "ModuleNotFoundError: No module named 'my_absent'",
+        "my_broken:Own": "ZeroDivisionError",
+        "my_exporters:Absent": "has no attribute 'Absent'",
+        "my_exporters:LIST": r"is \[\]: give a subclass of mjx_drax.Exporter",
+        "my_exporters:Base": "has no file",
+        "my_exporters:Choosy": "Choosy cannot be made: TypeError",
+    }.items():
+        with pytest.raises(DraxError, match=words):
+            exporter(text)
 
 
 def test_extras_that_are_missing_are_named(slider, tmp_path, without):

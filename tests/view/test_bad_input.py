@@ -5,9 +5,9 @@ import pytest
 from builders import INF, NAN, At, assert_complains, cases, made_up, parts, point
 
 from mjx_drax import render, render_diffusion, render_timelapse, save_html
+from mjx_drax.view.phase_plots import plot_phase
 from mjx_drax.view.plotting import plot_optima, plot_solution
-from mjx_drax.view.portraits import plot_phase
-from mjx_drax.view.rendering import render_frames
+from mjx_drax.view.video import render_frames
 
 
 def frames(**arguments):
@@ -26,13 +26,13 @@ def film(at, **arguments):
 # fmt: off
 PICTURES = [
     ("film-suffix", lambda at: render(at.answer, at.folder / "film.avi"),
-     "film.avi", ".mp4", "change"),
+     "film.avi", ".mp4", "rename"),
     ("film-none", lambda at: render(at.answer, None), "path is None"),
     ("film-folder",
      lambda at: ((at.folder / "a.mp4").mkdir(), render(at.answer, at.folder / "a.mp4")),
      "folder"),
     ("film-under-file", lambda at: render(at.answer, at.file("f") / "a.mp4"),
-     "cannot write", "choose"),
+     "cannot write", "Choose another place"),
     ("fps-nan", lambda at: film(at, fps=NAN), "fps is nan"),
     ("fps-0", lambda at: film(at, fps=0), "fps is 0"),
     ("fps-text", lambda at: film(at, fps="fast"), "fps is 'fast'"),

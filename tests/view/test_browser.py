@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, save_html
+from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.states import set_state
 from mjx_drax.tasks import load
-from mjx_drax.view.browser import require_viewer
+from mjx_drax.view.exporters import Html
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,7 @@ def test_every_kind_of_geom_is_there(recording):
 
 
 def test_bodies_move_as_the_engine_replayed_them(slider, recording):
-    model = slider.problem.dynamics.mj_model
+    model = mujoco_model(slider.problem.dynamics)
     data = mujoco.MjData(model)
     moves = [
         (time, message["position"])
@@ -83,7 +84,7 @@ def test_a_replay_that_turns_nan_is_shown_up_to_there(slider, tmp_path):
 
 def test_what_is_refused(slider, tmp_path, without, monkeypatch):
     with pytest.raises(DraxError, match="bug_trap has no MuJoCo model to show in a browser"):
-        require_viewer(load("bug_trap").make())
+        Html().check(load("bug_trap").make())
     without("viser")
     with pytest.raises(DraxError, match=r'needs viser.*pip install "mjx-drax\[html\]"'):
         save_html(slider, tmp_path / "replay.html")

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import matplotlib
-import mujoco
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -17,10 +16,13 @@ from PIL import Image
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.method.langevin import Langevin
+from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.search.restarts import Restarts
-from mjx_drax.solution.solution import WITH_FEEDBACK, Solution, solve
+from mjx_drax.solution.replay import WITH_FEEDBACK
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
-from mjx_drax.view import plotting, portraits
+from mjx_drax.view import labels, phase_plots, plotting
 from mjx_drax.view.plotting import plot_solution
 
 
@@ -146,14 +148,13 @@ def test_paths_that_cannot_be_written(pendulum: Solution, tmp_path: Path) -> Non
         plot_solution(pendulum, tmp_path / "file" / "plot.png")
 
 
-def _dynamics(name: str) -> SimpleNamespace:
-    path = Path(__file__).parents[2] / "models" / f"{name}.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
-    return SimpleNamespace(mj_model=model, ndx=2 * model.nv + model.na)
+@pytest.fixture(scope="module")
+def quadrotor() -> Dynamics:
+    return load("quadrotor").make().dynamics
 
 
-def test_quaternions_have_a_panel_of_their_own() -> None:
-    groups = dict(plotting._state_groups(_dynamics("quadrotor")))  # type: ignore[arg-type]
+def test_quaternions_have_a_panel_of_their_own(quadrotor: Dynamics) -> None:
+    groups = labels.state_groups(quadrotor)
     assert list(groups) == ["positions", "orientations", "velocities"]
     assert groups["positions"] == {0: "root x [m]", 1: "root y [m]", 2: "root z [m]"}
     assert groups["orientations"][3] == "root qw"
@@ -161,28 +162,25 @@ def test_quaternions_have_a_panel_of_their_own() -> None:
     assert groups["velocities"][12] == "root turn z [rad/s]"
 
 
-def test_phase_portraits_of_turns_are_in_tangent_space() -> None:
-    quadrotor: Any = _dynamics("quadrotor")
-    assert [c.position for c in portraits.coordinates(quadrotor)[2:4]] == [
-        "root z [m]",
-        "root turn x [rad]",
-    ]
-    assert len(portraits._tangent_names(quadrotor)) == 12
+def test_phase_plots_of_turns_are_in_tangent_space(quadrotor: Dynamics) -> None:
+    names = [c.position for c in labels.coordinates(quadrotor)]
+    assert names[2:4] == ["root z [m]", "root turn x [rad]"]
+    assert len(labels.tangent_labels(quadrotor)) == 12
     angle = np.linspace(0.0, 3.0, 5)
     states = np.zeros((5, 13))
     states[:, 0], states[:, 12] = 2.0, 1.5
     states[:, 3], states[:, 6] = np.cos(angle / 2), np.sin(angle / 2)
-    positions, velocities = portraits._phases(quadrotor, states)
+    positions, velocities = phase_plots._phases(quadrotor, states)
     np.testing.assert_allclose(positions[:, 5], angle, atol=1e-9)
     np.testing.assert_array_equal(positions[:, 0], 2.0)
     np.testing.assert_array_equal(velocities[:, 5], 1.5)
 
 
-def test_portraits(pendulum: Solution, cartpole: Solution, tmp_path: Path) -> None:
+def test_phases_and_multipliers(pendulum: Solution, cartpole: Solution, tmp_path: Path) -> None:
     for solution, width in ((pendulum, 780), (cartpole, 960)):
-        assert _size(portraits.plot_phase(solution, tmp_path / "phase.png"))[0] == width
+        assert _size(phase_plots.plot_phase(solution, tmp_path / "phase.png"))[0] == width
     for solution, rows in ((pendulum, 2), (cartpole, 4)):
-        size = _size(portraits.plot_multipliers(solution, tmp_path / "multipliers.png"))
+        size = _size(phase_plots.plot_multipliers(solution, tmp_path / "multipliers.png"))
         assert size == (1050, round(150 * (0.24 * rows + 1.7)))
 
 
@@ -190,7 +188,7 @@ def test_what_has_no_phases(tmp_path: Path) -> None:
     problem = SimpleNamespace(name="three", dynamics=SimpleNamespace(nx=3))
     three: Any = SimpleNamespace(problem=problem)
     with pytest.raises(DraxError, match="which of them are velocities"):
-        portraits.plot_phase(three, tmp_path / "phase.png")
+        phase_plots.plot_phase(three, tmp_path / "phase.png")
 
 
 def test_marks_are_where_attempts_began(pendulum: Solution) -> None:

@@ -1,4 +1,4 @@
-"""Frames and videos, with OpenGL where the machine has it and with the painter everywhere."""
+"""Frames and videos, with OpenGL where the machine has it and with numpy everywhere."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from matplotlib.axes import Axes
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.method.langevin import Langevin
-from mjx_drax.physics import states as host
+from mjx_drax.physics.states import interpolated
 from mjx_drax.search.restarts import Restarts
-from mjx_drax.solution.solution import Solution, solve
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
-from mjx_drax.view import rendering
+from mjx_drax.view import renderer, video
 
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 120, 160
@@ -34,7 +35,7 @@ def _model(name: str) -> mujoco.MjModel:
 def _has_opengl() -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return rendering._gl_context() is not None
+        return renderer._gl_context() is not None
 
 
 def _amber(frame: np.ndarray) -> np.ndarray:
@@ -88,22 +89,22 @@ def _judged(solution: Solution, feasible: bool, open_loop: bool, feedback: bool)
 
 @pytest.fixture(autouse=True)
 def _fresh_choice() -> Iterator[None]:
-    rendering._gl_context.cache_clear()
+    renderer._gl_context.cache_clear()
     yield
-    rendering._gl_context.cache_clear()
+    renderer._gl_context.cache_clear()
 
 
-@pytest.fixture(params=["opengl", "painter"])
+@pytest.fixture(params=["opengl", "software"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "painter":
-        monkeypatch.setattr(rendering, "_gl_context", lambda: None)
+    if request.param == "software":
+        monkeypatch.setattr(renderer, "_gl_context", lambda: None)
     elif not _has_opengl():
         pytest.skip("no OpenGL on this machine")
     return str(request.param)
 
 
 def test_frames_have_the_asked_shape(backend: str) -> None:
-    frames = rendering.render_frames(
+    frames = video.render_frames(
         _model("pendulum"), [[0.0], [1.0]], [0.0, 0.5], fps=10, size=(HEIGHT, WIDTH)
     )
     assert frames.shape == (6 + 5, HEIGHT, WIDTH, 3)  # six instants, then half a second held
@@ -126,7 +127,7 @@ def test_the_robot_is_where_its_angle_says(
 ) -> None:
     down = [0.0] * len(up)
     poses = np.array([down, right, up, [-angle for angle in right]])
-    frames = rendering.render_frames(_model(name), poses, range(4), fps=1, size=(HEIGHT, WIDTH))
+    frames = video.render_frames(_model(name), poses, range(4), fps=1, size=(HEIGHT, WIDTH))
     middles = [np.argwhere(_amber(frame)).mean(axis=0) for frame in frames[:4]]
     (down_y, down_x), (right_y, right_x), (up_y, up_x), (_, left_x) = middles
     assert left_x + 5 < down_x < right_x - 5
@@ -143,7 +144,7 @@ def test_the_robot_is_where_its_angle_says(
     ],
 )
 def test_the_main_camera_sees_every_pose(name: str, poses: list[list[float]], backend: str) -> None:
-    frames = rendering.render_frames(
+    frames = video.render_frames(
         _model(name), poses, range(len(poses)), fps=1, size=(HEIGHT, WIDTH)
     )
     for frame in frames:
@@ -154,25 +155,25 @@ def test_the_main_camera_sees_every_pose(name: str, poses: list[list[float]], ba
 
 
 @pytest.mark.parametrize("name", ["pendulum", "acrobot", "cartpole"])
-def test_painter_agrees_with_opengl(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_software_rendering_agrees_with_opengl(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if not _has_opengl():
         pytest.skip("no OpenGL on this machine")
     model = _model(name)
     poses = np.linspace(0.0, 2.5, 4)[:, None] * np.ones(model.nq)
     poses[:, 0] = np.minimum(poses[:, 0], 1.8) if name == "cartpole" else poses[:, 0]
-    opengl = rendering.render_frames(model, poses, range(4), fps=1)
-    monkeypatch.setattr(rendering, "_gl_context", lambda: None)
-    painted = rendering.render_frames(model, poses, range(4), fps=1)
-    for one, other in zip(_amber(opengl), _amber(painted), strict=True):
+    opengl = video.render_frames(model, poses, range(4), fps=1)
+    monkeypatch.setattr(renderer, "_gl_context", lambda: None)
+    without = video.render_frames(model, poses, range(4), fps=1)
+    for one, other in zip(_amber(opengl), _amber(without), strict=True):
         assert np.sum(one & other) > 0.7 * np.sum(one | other)
-    assert np.abs(opengl.astype(int) - painted).mean() < 20
+    assert np.abs(opengl.astype(int) - without).mean() < 20
 
 
 def test_video_is_one_that_browsers_play(tmp_path: Path, backend: str) -> None:
     import imageio_ffmpeg
 
     path = tmp_path / "new" / "swing.mp4"
-    written = rendering.render_motion(
+    written = video.render_motion(
         _model("pendulum"),
         [[0.0], [2.0]],
         [0.0, 1.0],
@@ -197,7 +198,7 @@ def test_film_of_a_model_shows_the_replay(cartpole: Solution, tmp_path: Path) ->
     far[:, :, 0] = np.linspace(-1.5, 1.5, far.shape[1])
     solution = _judged(cartpole, feasible=True, open_loop=False, feedback=True)
     solution = replace(solution, feedback=replace(solution.feedback, states=far))
-    path = rendering.render(solution, tmp_path / "film.mp4", fps=20, size=(2 * HEIGHT, 2 * WIDTH))
+    path = video.render(solution, tmp_path / "film.mp4", fps=20, size=(2 * HEIGHT, 2 * WIDTH))
     frames = _decoded(path, 2 * HEIGHT, 2 * WIDTH)
     assert len(frames) == 5 + 10
     left, right = (np.argwhere(_amber(frames[i]))[:, 1].mean() for i in (0, -1))
@@ -211,7 +212,7 @@ def test_film_of_a_function_draws_the_replay_so_far(pendulum: Solution, tmp_path
         seen.append(states)
         _draw_angle(axes, states)
 
-    path = rendering.render(pendulum, tmp_path / "film.mp4", fps=20, size=(239, 320), draw=draw)
+    path = video.render(pendulum, tmp_path / "film.mp4", fps=20, size=(239, 320), draw=draw)
     frames = _decoded(path, 240, 320)
     assert len(frames) == 21 + 10
     assert [len(states) for states in seen] == list(range(1, 12))  # each knot once
@@ -225,7 +226,7 @@ def test_film_of_a_replay_that_blows_up_stops_there(cartpole: Solution, tmp_path
     blown[:, 6:] = np.nan
     solution = _judged(cartpole, feasible=True, open_loop=False, feedback=False)
     solution = replace(solution, feedback=replace(solution.feedback, states=blown))
-    path = rendering.render(solution, tmp_path / "film.mp4", fps=20, size=(HEIGHT, WIDTH))
+    path = video.render(solution, tmp_path / "film.mp4", fps=20, size=(HEIGHT, WIDTH))
     assert len(_decoded(path, HEIGHT, WIDTH)) == 3 + 10
 
 
@@ -249,7 +250,7 @@ def test_overlay_says_what_is_certified(
 ) -> None:
     for solution, engine in ((cartpole, "MuJoCo C replay"), (pendulum, "float64 rollout")):
         judged = _judged(solution, feasible, open_loop, feedback)
-        lines = rendering.outcome_lines(judged)
+        lines = video.outcome_lines(judged)
         assert lines[0] == judged.problem.name
         assert (f"NOT CERTIFIED: {warning}" == lines[1]) == (not judged.certified)
         defect = "1e-06" if feasible else "0.1"
@@ -266,7 +267,7 @@ def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) ->
         # The same motion, so that only the words differ.
         judged = replace(judged, open_loop=replace(judged.feedback))
         path = tmp_path / f"{success}.mp4"
-        rendering.render(judged, path, fps=2, size=(240, 320), draw=_draw_angle)
+        video.render(judged, path, fps=2, size=(240, 320), draw=_draw_angle)
         first.append(_decoded(path, 240, 320)[0])
     good, bad = (frame[:60].astype(int) for frame in first)
     assert np.sum(bad[..., 0] > bad[..., 1] + 60) > 2000  # red
@@ -275,18 +276,18 @@ def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) ->
 
 def test_a_function_without_draw_has_no_film(pendulum: Solution, tmp_path: Path) -> None:
     with pytest.raises(DraxError, match=r"pendulum has no model to film: pass draw="):
-        rendering.render(pendulum, tmp_path / "film.mp4")
+        video.render(pendulum, tmp_path / "film.mp4")
     with pytest.raises(DraxError, match="fps"):
-        rendering.render(pendulum, tmp_path / "film.mp4", draw=_draw_angle, fps=0)
+        video.render(pendulum, tmp_path / "film.mp4", draw=_draw_angle, fps=0)
     with pytest.raises(DraxError, match="size"):
-        rendering.render(pendulum, tmp_path / "film.mp4", draw=_draw_angle, size=(0, 0))
+        video.render(pendulum, tmp_path / "film.mp4", draw=_draw_angle, size=(0, 0))
     assert not list(tmp_path.iterdir())
 
 
 def test_overlay_is_drawn_and_tells_the_time(backend: str) -> None:
     model, poses, times = _model("pendulum"), [[0.0], [0.0]], [0.0, 1.0]
-    plain = rendering.render_frames(model, poses, times, fps=2)
-    lines = rendering.render_frames(model, poses, times, fps=2, overlay=("cost 1.0", "t = {time}"))
+    plain = video.render_frames(model, poses, times, fps=2)
+    lines = video.render_frames(model, poses, times, fps=2, overlay=("cost 1.0", "t = {time}"))
     changed = np.argwhere(np.any(plain[0] != lines[0], axis=-1))
     assert len(changed) > 1000
     assert changed.max(axis=0)[0] < plain.shape[1] // 3
@@ -296,8 +297,8 @@ def test_overlay_is_drawn_and_tells_the_time(backend: str) -> None:
 
 def test_wide_overlay_shrinks_to_fit(backend: str) -> None:
     lines = ("replayed in MuJoCo C: max|h| 1.0e-06, bound violation 0, reaches the goal",)
-    frames = rendering.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2, overlay=lines)
-    plain = rendering.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2)
+    frames = video.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2, overlay=lines)
+    plain = video.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2)
     assert not np.any((frames != plain)[:, :, -8:])
 
 
@@ -308,7 +309,7 @@ def test_a_model_without_cameras_is_framed(backend: str) -> None:
         </worldbody></mujoco>"""
     )
     poses = [[0.0, 0, 5, 1, 0, 0, 0], [3.0, 0, 6, 0, 1, 0, 0]]
-    for frame in rendering.render_frames(model, poses, [0.0, 1.0], fps=4, size=(HEIGHT, WIDTH)):
+    for frame in video.render_frames(model, poses, [0.0, 1.0], fps=4, size=(HEIGHT, WIDTH)):
         seen = np.argwhere(_amber(frame))
         assert len(seen) > 20
         assert np.all(seen.min(axis=0) > 0)
@@ -322,9 +323,9 @@ def test_interpolation_follows_geodesics() -> None:
     )
     quarter = np.array([np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)])
     poses, times = np.array([[1.0, 0.0, 0.0, 0.0], quarter]), np.array([0.0, 2.0])
-    middle = host.interpolated(model, poses, times, 1.0)
+    middle = interpolated(model, poses, times, 1.0)
     np.testing.assert_allclose(middle, [np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)], atol=1e-12)
-    np.testing.assert_array_equal(host.interpolated(model, poses, times, 2.0), quarter)
+    np.testing.assert_array_equal(interpolated(model, poses, times, 2.0), quarter)
 
 
 def test_bad_input_is_refused_before_drawing(tmp_path: Path) -> None:
@@ -333,25 +334,25 @@ def test_bad_input_is_refused_before_drawing(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
     with pytest.raises(DraxError, match=r"no camera .side..*main"):
-        rendering.render_frames(model, *good, camera="side")
+        video.render_frames(model, *good, camera="side")
     with pytest.raises(DraxError, match=r"no camera 3.*main"):
-        rendering.render_frames(model, *good, camera=3)
+        video.render_frames(model, *good, camera=3)
     with pytest.raises(DraxError, match=r"\(T, 1\)"):
-        rendering.render_frames(model, [[0.0, 0.0]], [0.0])
+        video.render_frames(model, [[0.0, 0.0]], [0.0])
     with pytest.raises(DraxError, match=r"times must have the shape"):
-        rendering.render_frames(model, good[0], [0.0])
+        video.render_frames(model, good[0], [0.0])
     with pytest.raises(DraxError, match=r"must not decrease"):
-        rendering.render_frames(model, good[0], [1.0, 0.0])
+        video.render_frames(model, good[0], [1.0, 0.0])
     with pytest.raises(DraxError, match=r"finite; row 1"):
-        rendering.render_frames(model, [[0.0], [np.nan]], good[1])
+        video.render_frames(model, [[0.0], [np.nan]], good[1])
     with pytest.raises(DraxError, match=r"fps"):
-        rendering.render_frames(model, *good, fps=0)
+        video.render_frames(model, *good, fps=0)
     with pytest.raises(DraxError, match=r"size"):
-        rendering.render_frames(model, *good, size=(0, 640))
+        video.render_frames(model, *good, size=(0, 640))
     with pytest.raises(DraxError, match=r"\.mp4"):
-        rendering.render_motion(model, *good, tmp_path / "video.avi")
+        video.render_motion(model, *good, tmp_path / "video.avi")
     with pytest.raises(DraxError, match=r"cannot write"):
-        rendering.render_motion(model, *good, file / "video.mp4")
+        video.render_motion(model, *good, file / "video.mp4")
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
 
 
@@ -360,10 +361,10 @@ def test_without_opengl_one_warning_names_the_packages(monkeypatch: pytest.Monke
         raise ImportError(f"no {name}")
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(rendering, "_tried_context", fail)
+    monkeypatch.setattr(renderer, "_tried_context", fail)
     motion = (_model("pendulum"), [[0.0]], [0.0])
     with pytest.warns(RuntimeWarning, match="apt-get install.*libegl1") as caught:
-        twice = [rendering.render_frames(*motion, fps=2, size=(HEIGHT, WIDTH)) for _ in range(2)]
+        twice = [video.render_frames(*motion, fps=2, size=(HEIGHT, WIDTH)) for _ in range(2)]
     assert len(caught) == 1
     assert twice[0].shape == (2, HEIGHT, WIDTH, 3)
 
@@ -380,9 +381,11 @@ def _run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
 def test_importing_changes_nothing() -> None:
     result = _run(
         "import os, sys; before = dict(os.environ)\n"
-        "import mjx_drax.view.rendering\n"
+        "import mjx_drax.physics.dynamics; there = set(sys.modules)\n"  # mujoco.mjx imports PIL
+        "import mjx_drax.view.video\n"
         "assert dict(os.environ) == before\n"
-        "assert not {'OpenGL', 'mujoco.egl', 'mediapy', 'PIL'} & set(sys.modules)\n"
+        "assert not {'OpenGL', 'mujoco.egl', 'mediapy'} & set(sys.modules)\n"
+        "assert not {'PIL', 'matplotlib'} & (set(sys.modules) - there)\n"
     )
     assert result.returncode == 0, result.stderr
 
@@ -390,9 +393,9 @@ def test_importing_changes_nothing() -> None:
 def test_drawing_leaves_the_environment_alone() -> None:
     result = _run(
         "import os; before = dict(os.environ)\n"
-        "import mujoco\nfrom mjx_drax import rendering\n"
+        "import mujoco\nfrom mjx_drax.view.video import render_frames\n"
         f"model = mujoco.MjModel.from_xml_path({str(ROOT / 'models' / 'pendulum.xml')!r})\n"
-        "rendering.render_frames(model, [[0.0]], [0.0], fps=2, size=(48, 64))\n"
+        "render_frames(model, [[0.0]], [0.0], fps=2, size=(48, 64))\n"
         "assert dict(os.environ) == before\n"
     )
     assert result.returncode == 0, result.stderr
@@ -402,7 +405,7 @@ def test_missing_libraries_of_a_chosen_backend_are_named(tmp_path: Path) -> None
     # With MUJOCO_GL=egl and no libEGL, `import mujoco` fails as this stand-in does.
     complaint = "'NoneType' object has no attribute 'eglQueryString'"
     (tmp_path / "mujoco.py").write_text(f"raise AttributeError({complaint!r})")
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import mjx_drax.view.rendering"
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import mjx_drax.view.video"
     result = _run(code, MUJOCO_GL="egl")
     assert result.returncode != 0
     last = result.stderr.splitlines()[-1]

@@ -17,11 +17,12 @@ from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Constant
 from mjx_drax.search import recording
 from mjx_drax.search.recording import Recorder, Recording, Snapshot, Tries
-from mjx_drax.solution.solution import Solution, solve
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
-from mjx_drax.view import film, rendering
-from mjx_drax.view import timelapse as ghosts
-from mjx_drax.view import video as movie
+from mjx_drax.view import diffusion, frames, renderer, scene, video
+from mjx_drax.view.diffusion import render_diffusion
+from mjx_drax.view.timelapse import render_timelapse
 
 SHORT = Langevin(iterations=6, tail=4, noise=Constant(0.1))
 
@@ -102,27 +103,27 @@ def test_film_of_a_model(
     cartpole: Solution, painted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if painted:
-        monkeypatch.setattr(rendering, "_gl_context", lambda: None)
-    path = film.render_diffusion(
+        monkeypatch.setattr(renderer, "_gl_context", lambda: None)
+    path = render_diffusion(
         cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(180, 240), ghosts=4
     )
     with Image.open(path) as image:
         assert image.size == (240, 180)
         # The scattered knots, their way, the end; then two tenths of a second, and it is held.
-        frames = []
+        shown = []
         for i in range(image.n_frames):  # type: ignore[attr-defined]
             image.seek(i)
-            frames.append(np.asarray(image.convert("RGB"), int))
-    scene = frames[0][:130]
-    difference = [np.abs(frame - frames[0]).mean() for frame in frames]
+            shown.append(np.asarray(image.convert("RGB"), int))
+    robots = shown[0][:130]
+    difference = [np.abs(frame - shown[0]).mean() for frame in shown]
     assert difference[-1] > 2.0
-    assert (scene[..., 0] > scene[..., 2] + 90).sum() > 50  # ghosts that break the dynamics
+    assert (robots[..., 0] > robots[..., 2] + 90).sum() > 50  # ghosts that break the dynamics
     assert [item.name for item in path.parent.iterdir()] == ["film.webp"]
 
 
 def test_film_of_a_function(trapped: Solution, tmp_path: Path) -> None:
     draw = load("bug_trap").draw
-    path = film.render_diffusion(
+    path = render_diffusion(
         trapped, tmp_path / "film.mp4", seconds=0.4, fps=5, size=(200, 300), draw=draw
     )
     assert path.stat().st_size > 2000
@@ -134,14 +135,14 @@ def test_paths_are_where_the_task_draws_them() -> None:
         axes.plot(10 * states[:, 1], states[:, 0])
 
     states = np.random.default_rng(0).normal(size=(3, 4, 2))
-    points = film._traced(draw, states)
+    points = diffusion._traced(draw, states)
     np.testing.assert_array_equal(points, states[..., ::-1] * [10, 1])
     with pytest.raises(DraxError, match="one vertex for each state"):
-        film._traced(lambda axes, states: None, states)
+        diffusion._traced(lambda axes, states: None, states)
 
 
 def test_colors_go_from_feasible_to_the_worst() -> None:
-    colors = film.Colors(10.0)
+    colors = diffusion.Colors(10.0)
     shades = colors([1e-9, 1e-3, 10.0, 99.0, np.nan])
     np.testing.assert_array_equal(shades[0], shades[1])
     np.testing.assert_array_equal(shades[2:], shades[[2, 2, 2]])
@@ -160,7 +161,7 @@ def test_film_time_is_spent_where_knots_move() -> None:
         x=x,
         defects=x[..., 0],
     )
-    at = film._positions(path, 4.0, 25.0)
+    at = diffusion._moments(path, 4.0, 25.0)
     assert (at[0], at[-1]) == (0.0, 20.0)
     assert (np.diff(at) >= 0.0).all()
     assert np.median(at) < 5.0
@@ -183,37 +184,35 @@ def _timeline(iteration: list[int], attempt: list[int]) -> recording.Path:
 def test_other_chains_are_shown_at_the_same_time() -> None:
     one = _timeline([0, 2, 4, 4, 6], [0, 0, 0, 1, 1])
     early, late = _timeline([0, 4], [0, 0]), _timeline([0, 4, 4, 8, 8, 12], [0, 0, 1, 1, 2, 2])
-    assert film._moment(one, late, 0.5) == (0, 1, 0.25)
-    assert film._moment(one, late, 2.0) == (1, 1, 0.0)  # its first attempt ends as well
-    assert film._moment(one, late, 3.0) == (2, 3, 0.0)  # the second begins
-    assert film._moment(one, late, 3.5) == (2, 3, 0.25)
-    assert film._moment(one, late, 4.0) == (5, 5, 0.0)  # its answer
-    assert film._moment(one, early, 3.5) == (1, 1, 0.0)
+    assert diffusion._same_moment(one, late, 0.5) == (0, 1, 0.25)
+    assert diffusion._same_moment(one, late, 2.0) == (1, 1, 0.0)  # its first attempt ends as well
+    assert diffusion._same_moment(one, late, 3.0) == (2, 3, 0.0)  # the second begins
+    assert diffusion._same_moment(one, late, 3.5) == (2, 3, 0.25)
+    assert diffusion._same_moment(one, late, 4.0) == (5, 5, 0.0)  # its answer
+    assert diffusion._same_moment(one, early, 3.5) == (1, 1, 0.0)
 
 
 def test_what_cannot_be_filmed(trapped: Solution, cartpole: Solution, tmp_path: Path) -> None:
     target = tmp_path / "film.mp4"
     bare = solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT)
     with pytest.raises(DraxError, match="record=1"):
-        film.render_diffusion(bare, target)
+        render_diffusion(bare, target)
     with pytest.raises(DraxError, match="pass draw="):
-        film.render_diffusion(trapped, target)
+        render_diffusion(trapped, target)
     for name, value in {"seconds": 0, "ghosts": -1, "chains": 0, "fps": 0, "speed": -1}.items():
         with pytest.raises(DraxError, match=name):
-            film.render_diffusion(cartpole, target, **{name: value})  # type: ignore[arg-type]
+            render_diffusion(cartpole, target, **{name: value})  # type: ignore[arg-type]
     with pytest.raises(DraxError, match="no camera 'side'"):
-        film.render_diffusion(cartpole, target, camera="side")
+        render_diffusion(cartpole, target, camera="side")
     with pytest.raises(DraxError, match=r"\.gif"):
-        film.render_diffusion(cartpole, tmp_path / "film.avi")
+        render_diffusion(cartpole, tmp_path / "film.avi")
     assert not list(tmp_path.iterdir())
 
 
 def test_timelapse(cartpole: Solution, tmp_path: Path) -> None:
     pictures = {}
     for count in (1, 2, 6):
-        path = ghosts.render_timelapse(
-            cartpole, tmp_path / f"{count}.png", count=count, size=(120, 160)
-        )
+        path = render_timelapse(cartpole, tmp_path / f"{count}.png", count=count, size=(120, 160))
         with Image.open(path) as image:
             assert image.size == (160, 120)
             pictures[count] = np.asarray(image.convert("RGB"), int)
@@ -222,11 +221,11 @@ def test_timelapse(cartpole: Solution, tmp_path: Path) -> None:
 
 def test_what_has_no_timelapse(cartpole: Solution, trapped: Solution, tmp_path: Path) -> None:
     with pytest.raises(DraxError, match="no model"):
-        ghosts.render_timelapse(trapped, tmp_path / "a.png")
+        render_timelapse(trapped, tmp_path / "a.png")
     with pytest.raises(DraxError, match="count"):
-        ghosts.render_timelapse(cartpole, tmp_path / "a.png", count=0)
+        render_timelapse(cartpole, tmp_path / "a.png", count=0)
     with pytest.raises(DraxError, match=r"\.png"):
-        ghosts.render_timelapse(cartpole, tmp_path / "a.jpg")
+        render_timelapse(cartpole, tmp_path / "a.jpg")
 
 
 def test_bodies_that_travel() -> None:
@@ -234,10 +233,10 @@ def test_bodies_that_travel() -> None:
     for name, body in names.items():
         path = Path(__file__).parents[2] / "models" / f"{name}.xml"
         model = mujoco.MjModel.from_xml_path(str(path))
-        index = ghosts.travelling_body(model)
+        index = scene.travelling_body(model)
         assert (None if index is None else model.body(index).name) == body
         if index is not None:
-            start = ghosts.places(model, index, np.tile(model.qpos0, (2, 3, 1)))
+            start = scene.body_positions(model, index, np.tile(model.qpos0, (2, 3, 1)))
             assert start.shape == (2, 3, 3)
 
 
@@ -250,7 +249,7 @@ def _frames(count: int) -> Iterator[np.ndarray]:
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_animations_loop_in_time(suffix: str, tmp_path: Path) -> None:
-    path = movie.write(tmp_path / f"a{suffix}", (f for f in _frames(12)), 24.0, (20, 30))
+    path = frames.write(tmp_path / f"a{suffix}", (f for f in _frames(12)), 24.0)
     with Image.open(path) as image:
         assert image.n_frames == 12  # type: ignore[attr-defined]
         assert image.info["loop"] == 0
@@ -266,21 +265,21 @@ def test_animations_loop_in_time(suffix: str, tmp_path: Path) -> None:
 
 def test_slow_motion_and_the_free_camera() -> None:
     times = np.array([0.0, 1.0])
-    assert len(rendering.frame_times(times, 10.0, 0.5)) == 21 + 5
+    assert len(video.frame_times(times, 10.0, 0.5)) == 21 + 5
     with pytest.raises(DraxError, match="speed"):
-        rendering.frame_times(times, 10.0, 0.0)
+        video.frame_times(times, 10.0, 0.0)
     path = Path(__file__).parents[2] / "models" / "cartpole.xml"
     model = mujoco.MjModel.from_xml_path(str(path))
     poses = np.array([[0.5, 0.0], [0.7, 3.0]])
-    near = rendering.view_of(model, poses, rendering.FREE, 1.3)
-    far = rendering.view_of(model, np.array([[-1.8, 0.0], [1.8, 3.0]]), rendering.FREE, 1.3)
+    near = scene.camera_for(model, poses, scene.FREE, 1.3)
+    far = scene.camera_for(model, np.array([[-1.8, 0.0], [1.8, 3.0]]), scene.FREE, 1.3)
     assert near.azimuth == pytest.approx(90.0)  # as the camera "main" looks
     assert 0.4 < near.lookat[0] < 0.8
     assert far.distance > 1.5 * near.distance
-    assert rendering.view_of(model, poses, None, 1.3).fixedcamid == 0
+    assert scene.camera_for(model, poses, None, 1.3).fixedcamid == 0
 
 
 def test_what_a_solve_could_not_film_is_refused_before_it() -> None:
     problem = SimpleNamespace(dynamics=SimpleNamespace(), name="thing")
     with pytest.raises(DraxError, match="thing has no model"):
-        rendering.check(problem)  # type: ignore[arg-type]
+        video.check(problem)  # type: ignore[arg-type]

@@ -1,0 +1,179 @@
+"""Frames with text on them, and files made of frames: .mp4, or .gif and .webp for web pages."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from functools import lru_cache
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.base.files import complete, file_path
+
+if TYPE_CHECKING:
+    from PIL import Image
+    from PIL.ImageFont import FreeTypeFont as Font
+
+    Box = tuple[float, float, float, float]
+
+Frame = npt.NDArray[np.uint8]
+"""A picture (height, width, 3)."""
+
+UNCERTIFIED = "NOT CERTIFIED"
+"""These words in a caption turn its box red."""
+
+SUFFIXES = (".mp4", ".gif", ".webp")
+
+_CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
+_WEBP_QUALITY = 60
+
+
+def write(path: str | os.PathLike[str], frames: Generator[Frame, None, None], fps: float) -> Path:
+    """Write frames into a file, all of one size, which `even_size` gives; returns its path.
+
+    The ending of the name says how: .mp4 (H.264, which browsers play), .gif or .webp (which
+    repeat). The file appears once it is complete.
+
+    Raises:
+      DraxError: before any frame is drawn, another ending or a folder that cannot be written to.
+    """
+    target = video_path(path)
+    with contextlib.closing(frames), complete(target) as partial:
+        partial.touch()  # complains before the first frame
+        if target.suffix.lower() == ".mp4":
+            _encode(partial, frames, fps)
+        else:
+            _animate(partial, frames, fps)
+    return target
+
+
+def video_path(path: str | os.PathLike[str]) -> Path:
+    """The path of a video; call it before a long computation.
+
+    Raises:
+      DraxError: its name ends in none of `SUFFIXES`.
+    """
+    target = file_path(path)
+    if target.suffix.lower() not in SUFFIXES:
+        raise DraxError(f"{target.name!r} does not end in {' or '.join(SUFFIXES)}: rename it.")
+    return target
+
+
+def _encode(path: Path, frames: Iterator[Frame], fps: float) -> None:
+    import imageio_ffmpeg
+    import mediapy
+
+    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())  # so that pip alone is enough
+    first = next(frames)
+    with mediapy.VideoWriter(
+        path, first.shape[:2], fps=fps, crf=_CRF, ffmpeg_args=("-movflags", "+faststart")
+    ) as writer:
+        for frame in chain([first], frames):
+            writer.add_image(frame)
+
+
+def _animate(path: Path, frames: Iterable[Frame], fps: float) -> None:
+    from PIL import Image
+
+    images: list[Image.Image] = [Image.fromarray(frame) for frame in frames]
+    gif = path.suffix.lower() == ".gif"
+    unit = 10 if gif else 1  # [ms] what the format counts time in
+    ends = [unit * round(1000 * i / (fps * unit)) for i in range(len(images) + 1)]
+    durations = [max(unit, b - a) for a, b in pairwise(ends)]
+    options: dict[str, Any] = {"quality": _WEBP_QUALITY, "method": 4}
+    if gif:
+        images, options = _with_palette(images), {"optimize": False, "disposal": 1}
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=durations, loop=0, **options
+    )
+
+
+def _with_palette(images: list[Image.Image]) -> list[Image.Image]:
+    """The images, all with the same 256 colors, so that what does not move does not flicker."""
+    from PIL import Image
+
+    few = images[:: max(1, len(images) // 8)]
+    width, height = images[0].size
+    sheet = Image.new("RGB", (width, height * len(few)))
+    for row, image in enumerate(few):
+        sheet.paste(image, (0, row * height))
+    palette = sheet.quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    return [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+
+
+def even_size(size: tuple[int, int]) -> tuple[int, int]:
+    """(height, width), both rounded up to even numbers, as H.264 needs them.
+
+    Raises:
+      DraxError: they are not two whole numbers within 16 and 8192.
+    """
+    try:
+        height, width = (int(side) for side in size)
+    except (TypeError, ValueError, OverflowError):
+        height = width = 0
+    if isinstance(size, str) or not (16 <= height <= 8192 and 16 <= width <= 8192):
+        raise DraxError(
+            f"size is {shown(size)}: give (height, width), both within 16 and 8192 pixels."
+        )
+    return height + height % 2, width + width % 2
+
+
+def captioned(frame: Frame, lines: Sequence[str], time: float) -> Frame:
+    """The frame with lines of text in a translucent box at its top left."""
+    if not lines:
+        return frame
+    from PIL import Image, ImageDraw
+
+    height, width = frame.shape[:2]
+    font, box = text_box(lines, height, width)
+    text = "\n".join(lines).replace("{time}", f"{time:.2f} s")
+    image = Image.fromarray(frame)
+    draw = ImageDraw.Draw(image, "RGBA")
+    margin = height // 40
+    fill = (150, 20, 20, 210) if UNCERTIFIED in text else (14, 18, 25, 185)
+    draw.rounded_rectangle(box, radius=margin // 2, fill=fill)
+    corner = (2 * margin, 2 * margin)
+    draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
+    return np.asarray(image)
+
+
+def text_box(lines: Sequence[str], height: int, width: int) -> tuple[Font, Box]:
+    """The font, and the box (left, top, right, bottom) around the text with its margin."""
+    return _fitted("\n".join(lines).replace("{time}", "00.00 s"), height, width)
+
+
+@lru_cache(maxsize=16)
+def _fitted(text: str, height: int, width: int) -> tuple[Font, Box]:
+    """The largest font, up to 1/28 of the height, with which the text fits, and its box."""
+    from PIL import Image, ImageDraw
+
+    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    margin = height // 40
+    corner = (2 * margin, 2 * margin)
+    for size in range(max(9, height // 28), 8, -1):
+        font = _font(size)
+        left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
+        if right <= width - 2 * margin and bottom <= height - 2 * margin:
+            break
+    return font, (left - margin, top - margin, right + margin, bottom + margin)
+
+
+def _font(size: int) -> Font:
+    """DejaVu Sans (it has mathematical signs), which matplotlib brings; else Pillow's own."""
+    from PIL import ImageFont
+
+    found = importlib.util.find_spec("matplotlib")  # located, not imported: that takes a second
+    if found is not None and found.origin is not None:
+        path = Path(found.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"
+        if path.exists():
+            return ImageFont.truetype(str(path), size)
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont)
+    return font

@@ -1,0 +1,191 @@
+"""What is drawn of a MuJoCo model: one or many poses of it, lines, and the camera that sees them.
+
+A MuJoCo scene is a list of geoms. Those of several poses can be appended to it, each in its own
+color, so that one frame shows a whole motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.view.geoms import Floats
+
+MAX_GEOMS = 20_000
+"""Geoms in one scene; MuJoCo leaves out what would be more."""
+
+FREE = "free"
+"""The camera that sees the whole motion."""
+
+_MARGIN = 1.1  # factor on the free camera's distance
+_POSES = 240  # so many poses of a motion decide where the free camera stands
+
+
+class Scene:
+    """A scene of one model, as a camera sees it; `data` holds the pose that was added last."""
+
+    def __init__(self, model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
+        self.content = mujoco.MjvScene(model, maxgeom=MAX_GEOMS)
+        self.data = mujoco.MjData(model)
+        self._model, self._camera = model, camera
+        self._option, self._perturbation = mujoco.MjvOption(), mujoco.MjvPerturb()
+
+    def begin(self, qpos: Floats | None) -> None:
+        """A new scene: what does not move, and the robot at qpos (nq,), if given."""
+        kinds = mujoco.mjtCatBit
+        kind = kinds.mjCAT_STATIC if qpos is None else kinds.mjCAT_ALL
+        set_pose(self._model, self.data, self._model.qpos0 if qpos is None else qpos)
+        mujoco.mjv_updateScene(
+            self._model, self.data, self._option, None, self._camera, kind.value, self.content
+        )
+
+    def add_robot(self, qpos: Floats, opacity: float, color: npt.ArrayLike | None = None) -> None:
+        """One more robot, translucent, at qpos (nq,), in its own colors or in one (3,)."""
+        first, moving = self.content.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+        set_pose(self._model, self.data, qpos)
+        mujoco.mjv_addGeoms(
+            self._model, self.data, self._option, self._perturbation, moving, self.content
+        )
+        for geom in self.content.geoms[first : self.content.ngeom]:
+            geom.rgba[3] *= opacity
+            if color is not None:
+                geom.rgba[:3] = color
+                geom.matid = -1
+                geom.emission, geom.specular, geom.reflectance = 0.1, 0.1, 0.0
+
+    def add_line(self, points: Floats, colors: Floats, width: float) -> None:
+        """A line through points (n, 3), whose n - 1 pieces have colors (n - 1, 4).
+
+        width [pixels] with OpenGL; capsules would take ten times as long without a GPU.
+        """
+        kind = mujoco.mjtGeom.mjGEOM_LINE
+        zero, turn = np.zeros(3), np.eye(3).ravel()
+        for start, end, color in zip(points[:-1], points[1:], colors, strict=True):
+            if self.content.ngeom >= self.content.maxgeom:
+                return
+            geom = self.content.geoms[self.content.ngeom]
+            mujoco.mjv_initGeom(geom, kind, zero, zero, turn, np.float32(color))
+            mujoco.mjv_connector(geom, kind, width, start, end)
+            self.content.ngeom += 1
+
+
+# Poses
+
+
+def set_pose(model: mujoco.MjModel, data: mujoco.MjData, qpos: Floats) -> None:
+    """Set the position and compute what a scene shows; no collisions, no forces."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
+    mujoco.mj_tendon(model, data)
+
+
+def posed(model: mujoco.MjModel, qpos: Floats) -> Iterator[mujoco.MjData]:
+    """The same data at each of the positions (T, nq), with the poses of bodies and geoms."""
+    data = mujoco.MjData(model)
+    for position in qpos:
+        data.qpos[:] = position
+        mujoco.mj_kinematics(model, data)
+        yield data
+
+
+def travelling_body(model: mujoco.MjModel) -> int | None:
+    """The first body that moves in the plane or in space, whose path tells much; None if none."""
+    free, slide = mujoco.mjtJoint.mjJNT_FREE.value, mujoco.mjtJoint.mjJNT_SLIDE.value
+    for body in range(1, model.nbody):
+        first = model.body_jntadr[body]
+        kinds = [int(kind) for kind in model.jnt_type[first : first + model.body_jntnum[body]]]
+        if free in kinds or kinds.count(slide) > 1:
+            return body
+    return None
+
+
+def body_positions(model: mujoco.MjModel, body: int, qpos: Floats) -> Floats:
+    """The centre of mass of a body in positions (..., nq), (..., 3)."""
+    flat = qpos.reshape(-1, model.nq)
+    centres = np.array([data.xipos[body].copy() for data in posed(model, flat)])
+    return centres.reshape(*qpos.shape[:-1], 3)
+
+
+# Cameras
+
+
+def camera_for(
+    model: mujoco.MjModel, qpos: Floats, wanted: str | int | None, aspect: float
+) -> mujoco.MjvCamera:
+    """The camera asked for, for a motion qpos (T, nq) in frames of an aspect, width / height.
+
+    `wanted` is a camera's name or index, or `FREE`; None is the camera "main", or else `FREE`.
+
+    Raises:
+      DraxError: there is no such camera.
+    """
+    names = [model.camera(index).name for index in range(model.ncam)]
+    if wanted is None:
+        wanted = "main" if "main" in names else FREE
+    if wanted == FREE and FREE not in names:
+        return _free_camera(model, qpos, aspect)
+    index = names.index(wanted) if wanted in names else wanted
+    if not isinstance(index, int | np.integer) or not 0 <= index < model.ncam:
+        known = ", ".join(name or f"{i} (unnamed)" for i, name in enumerate(names)) or "none"
+        raise DraxError(
+            f"no camera {shown(wanted)} in this model: use {FREE!r}, or of its own: {known}"
+        )
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    camera.fixedcamid = index
+    return camera
+
+
+def _free_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoco.MjvCamera:
+    """A camera that sees every moving geom in every pose of the motion.
+
+    It looks in the direction of the camera "main" at qpos0, if there is one. With axes right, up
+    and ahead, a ball of radius b at (x, y, z) from the middle of all is within a half angle a of
+    the frame if the camera stands (|x| cos a + b) / sin a - z or more before the middle.
+    """
+    sized = model.geom_rbound > 0.0  # planes have none
+    moving = sized & (model.body_weldid[model.geom_bodyid] != 0)
+    chosen = moving if np.any(moving) else sized
+    poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, _POSES).astype(int))]
+    points = np.array([data.geom_xpos[chosen] for data in posed(model, poses)]).reshape(-1, 3)
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.azimuth, camera.elevation = _direction(model)
+    center, bound = model.stat.center, np.array([model.stat.extent])
+    if points.size:
+        center = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        bound = np.tile(model.geom_rbound[chosen], len(poses))
+    azimuth, elevation = np.radians([camera.azimuth, camera.elevation])
+    flat = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    ahead = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([flat[1], -flat[0], 0.0])
+    axes = np.array([right, np.cross(right, ahead), ahead])
+    across, up, depth = axes @ (points - center).T if points.size else np.zeros(3)
+    half = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * np.array([aspect, 1.0]))
+    distance, shift = 0.0, np.zeros(2)
+    for i, (offset, angle) in enumerate(zip((across, up), half, strict=True)):
+        low, high = np.min(offset - bound), np.max(offset + bound)
+        shift[i] = (low + high) / 2.0
+        reach = (np.abs(offset - shift[i]) * np.cos(angle) + bound) / np.sin(angle) - depth
+        distance = max(distance, float(reach.max()))
+    camera.lookat[:] = center + shift @ axes[:2]
+    camera.distance = _MARGIN * distance
+    return camera
+
+
+def _direction(model: mujoco.MjModel) -> tuple[float, float]:
+    """Azimuth and elevation [degrees] of the camera "main", or usual ones."""
+    main = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA.value, "main")
+    if main < 0:
+        return 110.0, -12.0
+    data = mujoco.MjData(model)
+    set_pose(model, data, model.qpos0)
+    ahead = -data.cam_xmat[main].reshape(3, 3)[:, 2]
+    azimuth, elevation = np.arctan2(ahead[1], ahead[0]), np.arcsin(np.clip(ahead[2], -1.0, 1.0))
+    return float(np.degrees(azimuth)), float(np.degrees(elevation))
