@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from mjx_drax.base.errors import DraxError, reason
 
 if TYPE_CHECKING:
-    from mjx_drax.method.langevin import Langevin
     from mjx_drax.problem.problem import Problem
     from mjx_drax.search.restarts import Restarts
 
@@ -34,7 +33,7 @@ on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
 """
 
 
-def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Langevin | Restarts]:
+def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restarts]:
     """The problem, over the file's horizon or one of so many seconds, and the settings to solve it.
 
     The file may define every argument of `from_mjcf` by its name.
@@ -44,7 +43,8 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Langevi
     """
     from inspect import signature
 
-    from mjx_drax import Langevin, Restarts, from_mjcf
+    from mjx_drax.physics.mjcf import from_mjcf
+    from mjx_drax.search.restarts import as_restarts
 
     module = _module(Path(cost))
     names = set(signature(from_mjcf).parameters) - {"model", "name"}
@@ -54,10 +54,7 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Langevi
     if "horizon" not in given:
         raise DraxError(f"no horizon: define it in {cost} or give --horizon SECONDS.")
     problem = from_mjcf(model, name=Path(model).stem, **given)
-    solver = getattr(module, "solver", None) or Restarts()
-    if not isinstance(solver, Langevin | Restarts):
-        raise DraxError(f"solver in {cost} is {solver!r}: give a mjx_drax.Restarts.")
-    return problem, solver
+    return problem, as_restarts(getattr(module, "solver", None))
 
 
 def _module(path: Path) -> ModuleType:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from mjx_drax.method.langevin import Info
+    from mjx_drax.method.descent import Info
 
 FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
@@ -28,7 +28,7 @@ class Bar:
         import numpy as np
         from tqdm import tqdm
 
-        from mjx_drax.method.langevin import FEASIBLE
+        from mjx_drax.search.iterate import FEASIBLE
 
         if self._bar is None:  # only now: before, it would count compilation as progress
             self._bar = tqdm(total=total, initial=done, file=sys.stderr, bar_format=FORMAT)

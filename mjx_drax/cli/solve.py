@@ -16,7 +16,6 @@ from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_n
 from mjx_drax.cli.progress import Bar
 
 if TYPE_CHECKING:
-    from mjx_drax.method.langevin import Langevin
     from mjx_drax.problem.problem import Problem
     from mjx_drax.search.restarts import Restarts
 
@@ -90,12 +89,12 @@ def run(options: argparse.Namespace) -> int:
     """Solve, save and draw; what cannot work is refused before anything compiles."""
     problem, solver, chains, draw = _asked(options)
     from mjx_drax.cli import summary
-    from mjx_drax.search.restarts import as_restarts
+    from mjx_drax.search.restarts import settled
     from mjx_drax.solution import save as results
-    from mjx_drax.solution.solution import solve
+    from mjx_drax.solution.solve import solve
     from mjx_drax.view.video import check as require_drawing
 
-    as_restarts(problem, chains, options.seed, solver)  # refuses settings that cannot work
+    settled(problem, chains, options.seed, solver)  # refuses settings that cannot work
     wanted = exports.chosen(options)
     for each in wanted:
         each.check(problem)
@@ -149,7 +148,7 @@ class Asked(NamedTuple):
     """What to solve, and how; `draw` draws what has no model."""
 
     problem: Problem
-    solver: Langevin | Restarts
+    solver: Restarts
     chains: int
     draw: Any
 
@@ -157,7 +156,7 @@ class Asked(NamedTuple):
 def _asked(options: argparse.Namespace) -> Asked:
     """The named task, or the user's own problem, with the settings that the options change."""
     from mjx_drax.search import settings
-    from mjx_drax.search.restarts import Restarts, with_iterations
+    from mjx_drax.search.restarts import Restarts
 
     if options.task is not None:
         if options.model or options.cost:
@@ -175,7 +174,7 @@ def _asked(options: argparse.Namespace) -> Asked:
     else:
         raise DraxError("give a task (see `mjx-drax list`), or both --model XML and --cost PY.")
     if options.iterations is not None:
-        solver = with_iterations(solver, options.iterations)
+        solver = solver.with_iterations(options.iterations)
     for text in options.settings:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (name and equals and value):

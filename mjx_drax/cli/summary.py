@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from mjx_drax.solution.solution import OPEN_LOOP, WITH_FEEDBACK, Solution
+from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
+from mjx_drax.solution.solution import Solution
 
 OPTIMA = 5
 """So many distinct optima are printed."""

@@ -14,10 +14,7 @@ without it the suites `cpu` and `gpu` leave IPOPT out, and `peers` refuses to st
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,10 +26,13 @@ import numpy as np
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import write_json
-from mjx_drax.method.langevin import Langevin, evaluate
+from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Diagonal
 from mjx_drax.method.schedules import Geometric
-from mjx_drax.search.restarts import Restarts, unit_of
+from mjx_drax.search.engine import cost_scale_of
+from mjx_drax.search.iterate import evaluate
+from mjx_drax.search.restarts import Restarts
+from mjx_drax.studies import one_thread
 from mjx_drax.studies.measurements import (
     OURS,
     STARTS,
@@ -44,7 +44,12 @@ from mjx_drax.studies.measurements import (
     tuned,
 )
 from mjx_drax.studies.other_methods.cem import CEM
-from mjx_drax.studies.other_methods.ipopt import FUNCTIONS, Transcription, require_casadi
+from mjx_drax.studies.other_methods.ipopt import (
+    FUNCTIONS,
+    Transcription,
+    has_casadi,
+    require_casadi,
+)
 from mjx_drax.studies.other_methods.mbd import MBD
 from mjx_drax.studies.other_methods.mppi import MPPI
 from mjx_drax.studies.reproduce.settings import PENDULUM_FLOW, TRAP_FLOW
@@ -89,6 +94,7 @@ SAMPLES, CHAINS_PER_RUN = 256, 16
 """Rollouts of one iteration of a shooting run; for so many of our chains there is one run."""
 
 ONE_THREAD_CHAINS = (1, 2, 4, 8, 16)
+"""Numbers of chains that are compared with IPOPT on one thread."""
 
 
 def run(
@@ -152,7 +158,7 @@ def _cpu(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iter
     yield from _tasks(names, seeds, chains)
     if "pendulum" in names:
         for seed in seeds:
-            yield from one_thread(seed, [n for n in ONE_THREAD_CHAINS if n <= (chains or n)])
+            yield from one_thread.run(seed, [n for n in ONE_THREAD_CHAINS if n <= (chains or n)])
 
 
 def _gpu(names: Sequence[str], seeds: Sequence[int], chains: int | None) -> Iterator[Row]:
@@ -240,46 +246,13 @@ def ablations(problem: Problem, solver: Restarts) -> dict[str, Langevin | Restar
     }
 
 
-def one_thread(seed: int, chains: Sequence[int] = ONE_THREAD_CHAINS) -> list[Row]:
-    """One pendulum on one CPU thread: IPOPT's starts, and this solver with several chain counts.
-
-    All in one process that is bound to one core. `solver` gets the suffix ", 1 thread"; rows of
-    this solver also say how long IPOPT's median start took, `peer_median_s`.
-
-    Raises:
-        DraxError: the process fails.
-    """
-    code = "import mjx_drax.studies.one_thread as child; child.main()"
-    result = subprocess.run(
-        [sys.executable, "-c", code, str(seed), *map(str, chains)],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)},
-        stdout=subprocess.PIPE,
-        check=False,
-    )
-    if result.returncode:
-        raise DraxError(
-            f"the comparison on one thread failed with status {result.returncode}: see above."
-        )
-    rows: list[Row] = json.loads(result.stdout.splitlines()[-1])
-    return rows
-
-
 def _random_pendulums(count: int, seeds: Sequence[int]) -> Iterator[Row]:
     problem, solver, _ = _task("pendulum")
     knots = jax.vmap(problem.draw)(jax.random.split(jax.random.key(0), 1024))
-    first = solver.first(unit_of(np.asarray(evaluate(problem, knots).cost)))
+    first = solver.first(cost_scale_of(np.asarray(evaluate(problem, knots).cost)))
     program = Transcription(problem) if has_casadi() else None
     for seed in seeds:
         yield random_states(problem, first, count, seed, program=program)
-
-
-def has_casadi() -> bool:
-    """Whether IPOPT can be asked."""
-    try:
-        require_casadi()
-    except DraxError:
-        return False
-    return True
 
 
 def _task(name: str) -> tuple[Problem, Restarts, int]:
@@ -302,7 +275,7 @@ def line(row: Row) -> str:
     """A row of the table, in Markdown."""
 
     def cell(key: str, form: str) -> str:
-        return "-" if row[key] is None else format(row[key], form)
+        return "-" if row.get(key) is None else format(row[key], form)
 
     return (
         f"| {row['problem']} | {row['horizon']} | {row['solver']} | {row['seed']} "
@@ -325,7 +298,4 @@ def save(rows: Sequence[Row], folder: str | os.PathLike[str]) -> list[Path]:
     from mjx_drax.studies.benchmark_plot import plot
 
     target = Path(folder)
-    return [
-        write_json(target / "benchmark.json", rows),
-        plot(rows, target / "benchmark.png"),
-    ]
+    return [write_json(target / "benchmark.json", rows), plot(rows, target / "benchmark.png")]

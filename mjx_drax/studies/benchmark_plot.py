@@ -45,7 +45,7 @@ def plot(rows: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
     """Draw the rows' curves as a PNG, and return its path."""
     panels: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
-        if not row["curve"]:
+        if not row.get("curve"):
             continue
         name, _, thread = row["solver"].partition(", ")
         panel = f"{row['problem']}, {thread}" if thread else row["problem"]

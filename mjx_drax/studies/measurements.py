@@ -1,7 +1,8 @@
 """One method on one problem, as a row of the benchmark.
 
-Every row has the fields of `FIELDS`; methods add their own. Whoever found a trajectory, it counts
-when the problem's own replay (MuJoCo's C engine, or float64 for functions) ends in the goal.
+A row leaves out what a method has no number for, and methods add their own. Whoever found a
+trajectory, it counts when the problem's own replay (MuJoCo's C engine, or float64 for functions)
+ends in the goal.
 
 `time_to_certified_s` is the time of solving until an answer could be handed over that a replay
 certifies, with that replay; compilation, and building IPOPT's program, are left out. It is None if
@@ -40,10 +41,15 @@ import numpy as np
 from jax import Array
 
 from mjx_drax import __version__
-from mjx_drax.method.langevin import FEASIBLE, Info, Langevin, worth
+from mjx_drax.method.descent import Info
+from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
-from mjx_drax.search.restarts import Restarts
-from mjx_drax.solution.solution import Solution, judged, solve
+from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.search.restarts import Restarts, as_restarts
+from mjx_drax.solution.replay import judged
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
 from mjx_drax.studies.many_starts import solve_each
 from mjx_drax.studies.other_methods import shooting
 
@@ -51,32 +57,6 @@ if TYPE_CHECKING:
     from mjx_drax.studies.other_methods.ipopt import Transcription
 
 Row = dict[str, Any]
-
-FIELDS = (
-    "problem",
-    "horizon",
-    "solver",
-    "seed",
-    "chains",
-    "success_rate",
-    "near_rate",
-    "certified",
-    "best_cost",
-    "cost_ratio",
-    "max_defect",
-    "evaluations",
-    "compile_time_s",
-    "solve_time_s",
-    "time_to_certified_s",
-    "time_to_near_s",
-    "curve",
-    "device",
-    "cpus",
-    "mjx_drax",
-    "jax",
-    "python",
-)
-"""What every row holds; None where a method has no such number."""
 
 OURS = "mjx_drax"
 """What `solver` says for this library with its default settings."""
@@ -118,7 +98,7 @@ def machine() -> Row:
 
 
 def row(problem: Problem, solver: str, seed: int, chains: int, **found: Any) -> Row:
-    """A row; what is not given is None."""
+    """A row, with the cost as a multiple of the best known one."""
     given = {
         "problem": problem.name,
         "horizon": problem.horizon,
@@ -131,7 +111,7 @@ def row(problem: Problem, solver: str, seed: int, chains: int, **found: Any) -> 
     cost, best = given.get("best_cost"), BEST_KNOWN.get(problem.name)
     if cost is not None and best is not None and given.get("certified"):
         given["cost_ratio"] = cost / best
-    return {name: given.get(name) for name in FIELDS} | given
+    return given
 
 
 def near(problem: Problem, cost: np.ndarray) -> np.ndarray:
@@ -202,7 +182,8 @@ def evaluations(solver: Langevin | Restarts, problem: Problem, chains: int, iter
     """
     dynamics = problem.dynamics
     linearization = 1 + dynamics.ndx + dynamics.nu
-    flow, tails = solver.flow, sum(end < iterations for end in solver.noise_ends)
+    attempts = as_restarts(solver)
+    flow, tails = attempts.flow, sum(end < iterations for end in attempts.noise_ends)
     searches = tails * int(flow.tail) * len(flow.preconditioner.ladder)
     return chains * problem.horizon * (iterations * linearization + searches)
 
@@ -260,7 +241,8 @@ def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> 
     plan[:, 0] = np.asarray(problem.x_init, float) if x_init is None else x_init
     gains = np.zeros((*u.shape, problem.dynamics.ndx))
     ran = problem.replay(plan, u, gains)
-    replays = judged(problem, ran[0], ran, partial(worth, problem))  # planned is what happened
+    values = Family.of_one(problem).cost_and_violation
+    replays = judged(problem, ran[0], ran, values)  # as if what happened had been planned
     seconds = _seconds(problem, plan[:1], u[:1], gains[:1])
     return Verdicts(replays.success, replays.cost, seconds)
 
@@ -296,7 +278,6 @@ def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | Non
         "ipopt",
         seed,
         starts,
-        iterations=None,
         certified=bool(success.any()),
         best_cost=float(costs[best]),
         max_defect=float(defects[best]),
@@ -383,10 +364,10 @@ def random_states(
     `max_defect` are medians over the states, `chains` their number.
     """
     states, keys = random_starts(problem.dynamics.nx, count, seed)
-    answers = solve_each(solver, problem, states, keys)
-    defect, cost = np.asarray(answers.info.max_defect), np.asarray(answers.info.cost)
-    u, x_init = np.asarray(answers.trajectory.u), np.asarray(states, float)
-    success = judge(problem, u, x_init).success & (defect < FEASIBLE)
+    knots, info, compile_time, seconds = solve_each(solver, problem, states, keys)
+    defect, cost = np.asarray(info.max_defect), np.asarray(info.cost)
+    x_init = np.asarray(states, float)
+    success = judge(problem, np.asarray(knots.u), x_init).success & (defect < FEASIBLE)
     total = int(solver.iterations) + int(solver.tail)
     found: Row = {
         "problem": f"{problem.name}, random x_init",
@@ -405,8 +386,8 @@ def random_states(
         "best_cost": float(np.median(cost)),
         "max_defect": float(np.median(defect)),
         "evaluations": evaluations(solver, problem, count, total),
-        "compile_time_s": answers.compile_time,
-        "solve_time_s": answers.solve_time,
+        "compile_time_s": compile_time,
+        "solve_time_s": seconds,
         **found,
     }
 

@@ -1,17 +1,45 @@
-"""One pendulum on one CPU thread; `benchmark.one_thread` starts this in a process of its own.
+"""One pendulum on one CPU thread: this solver with several numbers of chains, beside IPOPT.
 
-The process binds itself to one core before jax starts its threads: `main` comes before any import
-of it. Rows go to standard output, as one line of JSON.
+All in one process, which binds itself to one core before jax starts its threads: `_main` comes
+before any import of it. Rows go to standard output, as one line of JSON.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
+from collections.abc import Sequence
+from typing import Any
+
+from mjx_drax.base.errors import DraxError
 
 
-def main() -> None:
+def run(seed: int, chains: Sequence[int]) -> list[dict[str, Any]]:
+    """Rows of IPOPT's starts and of each number of chains, from a process of its own.
+
+    `solver` gets the suffix ", 1 thread"; rows of this solver also say how long IPOPT's median
+    start took, `peer_median_s`.
+
+    Raises:
+        DraxError: the process fails.
+    """
+    result = subprocess.run(
+        [sys.executable, "-m", __name__, str(seed), *map(str, chains)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)},
+        stdout=subprocess.PIPE,
+        check=False,
+    )
+    if result.returncode:
+        raise DraxError(
+            f"the comparison on one thread failed with status {result.returncode}: see above."
+        )
+    rows: list[dict[str, Any]] = json.loads(result.stdout.splitlines()[-1])
+    return rows
+
+
+def _main() -> None:
     """Arguments: the seed, then the numbers of chains."""
     seed, *chains = map(int, sys.argv[1:])
     if hasattr(os, "sched_setaffinity"):  # elsewhere than on Linux, only the settings below
@@ -24,8 +52,8 @@ def main() -> None:
     }
     from mjx_drax import tasks
     from mjx_drax.search.restarts import Restarts
-    from mjx_drax.studies.benchmark import has_casadi
     from mjx_drax.studies.measurements import STARTS, ipopt, ours
+    from mjx_drax.studies.other_methods.ipopt import has_casadi
 
     problem, rows, median = tasks.load("pendulum").make(), [], None
     if has_casadi():
@@ -34,3 +62,7 @@ def main() -> None:
     for number in chains:
         rows.append(ours(problem, Restarts(), number, seed) | {"peer_median_s": median})
     print(json.dumps([row | {"solver": f"{row['solver']}, 1 thread"} for row in rows]))
+
+
+if __name__ == "__main__":
+    _main()

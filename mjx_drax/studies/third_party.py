@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import write_json
 
 Row = dict[str, Any]
 
@@ -56,7 +57,7 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
     from mjx_drax.physics.dynamics import MjxDynamics
     from mjx_drax.physics.mjx_model import constraint_rows
     from mjx_drax.physics.source import load
-    from mjx_drax.solution.solution import solve
+    from mjx_drax.solution.solve import solve
 
     row: Row = {"model": name}
     try:
@@ -151,10 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(line(row), flush=True)
         rows.append(row)
         if options.out:  # after every row, because a run takes long
-            from mjx_drax.solution.save import writable
-
-            text = json.dumps(rows, indent=1) + "\n"
-            (writable(options.out) / "third_party.json").write_text(text, encoding="utf-8")
+            write_json(Path(options.out) / "third_party.json", rows)
     return 0 if options.here or all(map(fine, rows)) else 1
 
 

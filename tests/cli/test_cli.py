@@ -16,7 +16,7 @@ import pytest
 from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
 from mjx_drax.cli import main
 from mjx_drax.physics.report import text
-from mjx_drax.search.restarts import CHUNK
+from mjx_drax.search.engine import REPORT_EVERY
 
 COST = """
 import jax.numpy as jnp
@@ -158,7 +158,7 @@ def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):
     arguments = "solve pendulum --horizon 0.5 --chains 2 --iterations 400 --no-video"
     assert main([*arguments.split(), "--out", str(tmp_path)]) == 1
     assert "written to" in capsys.readouterr().out
-    assert Solution.load(tmp_path).iterations == CHUNK
+    assert Solution.load(tmp_path).iterations == REPORT_EVERY
 
 
 def test_ctrl_c_before_there_is_anything_to_save(monkeypatch, capsys):
@@ -183,7 +183,7 @@ def test_settings_are_set_by_name(tmp_path, capsys):
 
 
 def test_json_is_all_that_is_printed(slider, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("mjx_drax.solution.solution.solve", lambda *_, **__: slider)
+    monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: slider)
     assert main(f"solve pendulum --no-video --json --out {tmp_path}".split()) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["task"] == "slider"
@@ -213,7 +213,7 @@ def test_an_exporter_of_your_own_is_given_by_its_name(slider, tmp_path, capsys, 
 
 def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, monkeypatch, without):
     monkeypatch.setattr(
-        "mjx_drax.solution.solution.solve", lambda *_, **__: pytest.fail("it was solved")
+        "mjx_drax.solution.solve.solve", lambda *_, **__: pytest.fail("it was solved")
     )
     assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--html")
     assert "no MuJoCo model" in error_of(capsys, "solve", "bug_trap", "--keyframes")
@@ -223,7 +223,7 @@ def test_exports_that_cannot_be_written_are_refused_before_the_solve(capsys, mon
 
 def test_places_that_cannot_be_written_are_refused_before_the_solve(own, capsys, monkeypatch):
     monkeypatch.setattr(
-        "mjx_drax.search.restarts._Search.run", lambda *_: pytest.fail("it was solved")
+        "mjx_drax.search.engine.Search.run", lambda *_: pytest.fail("it was solved")
     )
     (own / "file").touch()
     short, inside = (
@@ -249,7 +249,7 @@ def test_a_checkpoint_is_gone_on_from(tmp_path, capsys, monkeypatch):
     main(arguments)
     assert "going on" not in capsys.readouterr().out
     first = Solution.load(tmp_path)
-    monkeypatch.setattr("mjx_drax.search.restarts._Search._advanced", None)
+    monkeypatch.setattr("mjx_drax.search.engine.Search._iterated", None)
     main(arguments)
     assert f"going on from {file}\n" in capsys.readouterr().out
     np.testing.assert_array_equal(Solution.load(tmp_path).trajectories.u, first.trajectories.u)

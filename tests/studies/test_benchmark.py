@@ -11,7 +11,7 @@ import pytest
 
 from mjx_drax import DraxError, Geometric, Langevin, Restarts, from_function, tasks
 from mjx_drax.cli import main
-from mjx_drax.studies import benchmark
+from mjx_drax.studies import benchmark, one_thread
 from mjx_drax.studies import measurements as measure
 from mjx_drax.studies.benchmark_plot import pooled
 from mjx_drax.studies.other_methods import shooting
@@ -179,11 +179,11 @@ def test_first_certified_answer_comes_before_the_last_iteration():
     times = [point[0] for point in row["curve"]]
     assert times == sorted(times)
     assert row["time_to_certified_s"] == times[0] < times[-1]
-    hopeless = replace(problem, aside=replace(problem.aside, goal=lambda x: False))
+    hopeless = replace(problem, goal=lambda x: False)
     row = measure.ours(hopeless, solver, 2, seed=0)
     assert row["time_to_certified_s"] is None
     assert row["certified"] is False
-    assert row["cost_ratio"] is None
+    assert "cost_ratio" not in row
 
 
 def test_an_answer_far_above_the_best_known_cost_is_not_near_it(monkeypatch):
@@ -220,7 +220,7 @@ def test_command_writes_a_list_of_rows(tmp_path, capsys, monkeypatch):
     states = rows[2]
     assert 0 <= states["share_feasible_1e-5"] <= states["share_feasible_1e-3"] <= 1
     for row in rows:
-        assert set(measure.FIELDS) <= set(row)
+        assert {"problem", "horizon", "seed", "success_rate", "best_cost", "device"} <= set(row)
         assert row["chains"] == 4
         assert row["jax"] == jax.__version__
     assert f"{rows[0]['success_rate']:.1%}" in capsys.readouterr().out
@@ -254,7 +254,7 @@ def test_ablations_take_out_one_part():
 
 @pytest.mark.slow
 def test_one_thread_is_one_core():
-    rows = benchmark.one_thread(0, [1])
+    rows = one_thread.run(0, [1])
     assert all(row["cpus"] == 1 for row in rows)
     assert rows[-1]["solver"] == "mjx_drax, 1 thread"
     assert rows[-1]["time_to_certified_s"] > 0

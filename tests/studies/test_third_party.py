@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError
-from mjx_drax.modelling.postures import NEAR, reach
+from mjx_drax.modelling.postures import TOLERANCE, reach
 from mjx_drax.models import path
 from mjx_drax.studies.third_party import FOLDERS, fine, line, main, measure_apart, models
 
@@ -49,7 +49,7 @@ def test_the_posture_can_be_reached_and_is_not_the_start():
     target = np.asarray(problem.terminal.residual.args[0].numbers[0], float)
     x = np.concatenate([target, np.zeros(host.nv)])
     assert problem.reached(x) is True
-    x[0] += 1.1 * NEAR
+    x[0] += 1.1 * TOLERANCE
     assert problem.reached(x) is False
 
 

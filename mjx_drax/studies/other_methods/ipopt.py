@@ -13,6 +13,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import jax
@@ -21,8 +23,12 @@ from numpy.typing import ArrayLike
 
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import require
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+
+require_casadi = partial(require, "casadi", "peers", "IPOPT")
+"""Complains if casadi is not installed."""
 
 OPTIONS = {
     "print_time": False,
@@ -41,14 +47,12 @@ class Functions:
 
 @dataclass(frozen=True)
 class Start:
-    """Where IPOPT ended: x (K, nx), u (K, nu), cost, max|h|, time [s], and what it said."""
+    """Where IPOPT ended: u (K, nu), cost, max|h|, and the time that it took [s]."""
 
-    x: np.ndarray
     u: np.ndarray
     cost: float
     max_defect: float
     seconds: float
-    status: str
 
 
 class Transcription:
@@ -59,7 +63,9 @@ class Transcription:
     """
 
     def __init__(self, problem: Problem) -> None:
-        casadi = require_casadi()
+        require_casadi()
+        import casadi
+
         if problem.name not in FUNCTIONS:
             raise DraxError(
                 f"{problem.name} is not written for CasADi: choose one of {', '.join(FUNCTIONS)}, "
@@ -96,17 +102,13 @@ class Transcription:
         The time is that of IPOPT alone: building and differentiating the program is done before.
         """
         lower, upper = (_flat(side) for side in self.problem.bounds.sides(guess))
+        start = self._start(x_init)
         clock = time.perf_counter()
-        result = self._solver(
-            x0=_flat(guess), lbx=lower, ubx=upper, lbg=0.0, ubg=0.0, p=self._start(x_init)
-        )
+        result = self._solver(x0=_flat(guess), lbx=lower, ubx=upper, lbg=0.0, ubg=0.0, p=start)
         seconds = time.perf_counter() - clock
-        z = result["x"].full().ravel()
-        split = guess.x.size
-        x, u = z[:split].reshape(guess.x.shape), z[split:].reshape(guess.u.shape)
-        cost, h = self._evaluate(z, self._start(x_init))
-        status = str(self._solver.stats()["return_status"])
-        return Start(x, u, float(cost), float(np.abs(h.full()).max()), seconds, status)
+        cost, h = self._evaluate(result["x"], start)
+        u = result["x"].full().ravel()[guess.x.size :].reshape(guess.u.shape)
+        return Start(u, float(cost), float(np.abs(h.full()).max()), seconds)
 
     def multistart(self, starts: int, seed: int, x_init: ArrayLike | None = None) -> list[Start]:
         """Solve from random knots, drawn as the solver's chains draw theirs."""
@@ -117,19 +119,9 @@ class Transcription:
         return np.asarray(self.problem.x_init if x_init is None else x_init, float)
 
 
-def require_casadi() -> Any:
-    """The module casadi.
-
-    Raises:
-        DraxError: it is not installed.
-    """
-    try:
-        import casadi
-    except ImportError as error:
-        raise DraxError(
-            'IPOPT needs casadi, which is not installed: pip install "mjx-drax[peers]".'
-        ) from error
-    return casadi
+def has_casadi() -> bool:
+    """Whether IPOPT can be asked."""
+    return find_spec("casadi") is not None
 
 
 def _flat(trajectory: Trajectory) -> np.ndarray:

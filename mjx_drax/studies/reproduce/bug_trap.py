@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin
-from mjx_drax.solution.solution import Solution, solve
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
 from mjx_drax.studies.reproduce import settings
 from mjx_drax.studies.reproduce.output import Numbers, new_figure, reaching, solve_row
 from mjx_drax.studies.reproduce.settings import NO_NOISE, with_budget
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def make(
-    chains: int = 256, iterations: int | None = None, longer: int = 50, seed: int = 0
+    chains: int = 256, iterations: int | None = None, longer: int = 50
 ) -> tuple[Numbers, Figure]:
     """The same knots, and the same budget of iterations, for every method.
 
@@ -32,18 +33,17 @@ def make(
         chains: of every method.
         iterations: the budget; that of the preconditioned settings by default.
         longer: factor of the second budget.
-        seed: of all random numbers.
     """
     problem = settings.bug_trap()
     budget = iterations or settings.budget_of(settings.TRAP)
     solvers = _methods(budget, longer)
-    start = settings.initial_knots(problem, chains, seed)
+    start = settings.initial_knots(problem, chains)
     columns = -(-len(solvers) // 2)
     figure = new_figure(2.6 * columns, 6.8)
     panels = figure.subplots(2, columns, sharex=True, sharey=True).ravel()
     rows = []
     for axes, (name, solver) in zip(panels, solvers.items(), strict=False):
-        solution = solve(problem, chains, seed, solver, guess=start)
+        solution = solve(problem, chains, solver=solver, guess=start)
         rows.append(solve_row(name, solution))
         _draw_paths(axes, solution)
         axes.set_title(f"{name}\n{_outcome(rows[-1])}", loc="left", fontsize=8)

@@ -12,10 +12,11 @@ import numpy as np
 from jax import Array
 from matplotlib.figure import Figure
 
-from mjx_drax.method.langevin import FEASIBLE, Langevin, State, advance, evaluate
+from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Constant
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
 from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure
@@ -26,7 +27,6 @@ def make(
     chains: int = 64,
     iterations: int | None = None,
     penalties: Sequence[float] = (0.01, 0.1, 1.0, 10.0, 100.0),
-    seed: int = 0,
 ) -> tuple[Numbers, Figure]:
     """Median and middle 80 % of the chains.
 
@@ -37,7 +37,6 @@ def make(
         chains: of each penalty.
         iterations: 20,000 by default.
         penalties: values of mu.
-        seed: of all random numbers; the same for every mu.
     """
     problem = settings.pendulum()
     flow = settings.pendulum_flows(iterations)["paper's flow"]
@@ -49,7 +48,7 @@ def make(
     for mu, color in zip(penalties, CURVES, strict=False):
         step = min(usual, 0.25 / mu)
         solver = replace(flow, penalty=Constant(mu), step_size=step)
-        squares, state = _violations(solver, problem, chains, seed, stops)
+        squares, state = _violations(solver, problem, chains, stops)
         low, median, high = np.nanquantile(squares, (0.1, 0.5, 0.9), axis=1)
         defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
         upright = judge(problem, np.asarray(state.trajectory.u, float)).success
@@ -88,14 +87,14 @@ def make(
 
 
 def _violations(
-    solver: Langevin, problem: Problem, chains: int, seed: int, stops: np.ndarray
+    solver: Langevin, problem: Problem, chains: int, stops: np.ndarray
 ) -> tuple[np.ndarray, State]:
     """|h|^2 (stops, chains) after the given numbers of iterations, and the last state."""
-    start = settings.initial_knots(problem, chains, seed)
-    state = solver.init(problem, start, jax.random.key(seed))
+    knots = settings.initial_knots(problem, chains)
+    state = start(solver, problem, knots, jax.random.key(0))
     squares = [np.asarray(_square(problem, state.trajectory))]
     for begin, end in pairwise(stops):
-        state = advance(solver, problem, state, int(begin), int(end))
+        state, _ = advance(solver, problem, state, int(begin), int(end))
         squares.append(np.asarray(_square(problem, state.trajectory)))
     return np.stack(squares), state
 

@@ -10,13 +10,15 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from mjx_drax.method.langevin import FEASIBLE, Langevin, advance, evaluate
-from mjx_drax.method.metrics import Diagonal, GaussNewton
+from mjx_drax.method.gauss_newton import GaussNewton
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.method.metrics import Diagonal
 from mjx_drax.method.schedules import Constant, Geometric
 from mjx_drax.problem.differentiators import Autodiff, Smoothed
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
-from mjx_drax.solution.solution import solve
+from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
+from mjx_drax.solution.solve import solve
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
 from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, solve_row
@@ -43,7 +45,6 @@ def make(
     iterations: int | None = None,
     limit: int | None = None,
     pairs: Sequence[int] = (2, 3, 4, 16),
-    seed: int = 0,
 ) -> tuple[Numbers, Figure]:
     """Metrics and gradients on the pendulum, annealing and noise on the bug trap.
 
@@ -52,7 +53,6 @@ def make(
         iterations: budget on the bug trap; that of the preconditioned settings by default.
         limit: most iterations that a metric gets to become feasible; 20,000 by default.
         pairs: antithetic pairs of samples for a gradient; a pendulum's knot has three directions.
-        seed: of all random numbers.
     """
     few = min(chains, 64)
     solvers = {
@@ -65,10 +65,10 @@ def make(
         ),
         "Gauss-Newton": settings.PENDULUM,
     }
-    metrics = _compare_metrics(solvers, few, limit or budget_of(settings.PENDULUM_FLOW), seed)
+    metrics = _compare_metrics(solvers, few, limit or budget_of(settings.PENDULUM_FLOW))
     trap = with_budget(settings.TRAP, iterations or budget_of(settings.TRAP))
-    annealing, sigmas = _compare_annealing(trap, chains, seed)
-    gradients = _compare_gradients(few, pairs, seed)
+    annealing, sigmas = _compare_annealing(trap, chains)
+    gradients = _compare_gradients(few, pairs)
     figure = new_figure(8.0, 6.4)
     panels = figure.subplots(2, 2)
     _draw_metrics(panels[0, 0], metrics, few)
@@ -84,20 +84,18 @@ def make(
     }, figure
 
 
-def _compare_metrics(
-    solvers: dict[str, Langevin], chains: int, limit: int, seed: int
-) -> list[Numbers]:
+def _compare_metrics(solvers: dict[str, Langevin], chains: int, limit: int) -> list[Numbers]:
     """Annealed solves of the pendulum with budgets that double until half the chains are feasible.
 
     Each metric anneals over its whole budget, so a row is a complete solve, not a point of one.
     """
     problem = settings.pendulum()
-    start, rows = initial_knots(problem, chains, seed), []
+    knots, rows = initial_knots(problem, chains), []
     for name, solver in solvers.items():
         budget, median = 0, np.inf
         while median >= FEASIBLE and budget < limit:
             budget = min(max(2 * budget, 20), limit)
-            solution = solve(problem, chains, seed, with_budget(solver, budget), guess=start)
+            solution = solve(problem, chains, solver=with_budget(solver, budget), guess=knots)
             rows.append(solve_row(name, solution))
             median = rows[-1]["median max|h|"]
     return rows
@@ -122,14 +120,12 @@ RULES: dict[str, Rule] = {
 """sigma from progress t in [0, 1], sigma so far, and the chains' costs."""
 
 
-def _compare_annealing(
-    solver: Langevin, chains: int, seed: int
-) -> tuple[list[Numbers], dict[str, Numbers]]:
+def _compare_annealing(solver: Langevin, chains: int) -> tuple[list[Numbers], dict[str, Numbers]]:
     """The bug trap under every rule: rows, and the values of sigma."""
     problem = settings.bug_trap()
     rows, sigmas = [], {}
     for name, rule in RULES.items():
-        trajectory, stops, values = _annealed(solver, problem, chains, seed, rule)
+        trajectory, stops, values = _annealed(solver, problem, chains, rule)
         info = evaluate(problem, trajectory)
         feasible = np.asarray(info.max_defect) < FEASIBLE
         escaped = feasible & judge(problem, np.asarray(trajectory.u, float)).success
@@ -151,13 +147,13 @@ def _compare_annealing(
 
 
 def _annealed(
-    solver: Langevin, problem: Problem, chains: int, seed: int, rule: Rule
+    solver: Langevin, problem: Problem, chains: int, rule: Rule
 ) -> tuple[Trajectory, list[int], list[float]]:
     """Final knots, and the sigmas that the rule gave at which iterations.
 
     sigma is a traced number: all rules run one compiled program.
     """
-    state = solver.init(problem, initial_knots(problem, chains, seed), jax.random.key(seed))
+    state = start(solver, problem, initial_knots(problem, chains), jax.random.key(0))
     noisy = int(solver.iterations)
     stops, values, sigma = list(range(0, noisy, EVERY)), [], 0.0
     for i in stops:
@@ -165,20 +161,21 @@ def _annealed(
         sigma = float(rule(i / max(stops[-1], 1), sigma, cost))
         values.append(sigma)
         now = replace(solver, noise=Geometric(sigma, sigma))
-        state = advance(now, problem, state, i, min(i + EVERY, noisy))
+        state, _ = advance(now, problem, state, i, min(i + EVERY, noisy))
     quiet = replace(solver, noise=settings.NO_NOISE)
-    return advance(quiet, problem, state, noisy, budget_of(solver)).trajectory, stops, values
+    state, _ = advance(quiet, problem, state, noisy, budget_of(solver))
+    return state.trajectory, stops, values
 
 
-def _compare_gradients(chains: int, pairs: Sequence[int], seed: int) -> list[Numbers]:
+def _compare_gradients(chains: int, pairs: Sequence[int]) -> list[Numbers]:
     """The pendulum with exact derivatives, and with those estimated from function values alone."""
     problem = settings.pendulum()
     choices = {"exact": GaussNewton(Autodiff())}
     choices |= {f"{n} pairs a knot": GaussNewton(Smoothed(n)) for n in pairs}
-    start, rows = initial_knots(problem, chains, seed), []
+    knots, rows = initial_knots(problem, chains), []
     for name, choice in choices.items():
         solver = replace(settings.PENDULUM, preconditioner=choice)
-        rows.append(solve_row(name, solve(problem, chains, seed, solver, guess=start)))
+        rows.append(solve_row(name, solve(problem, chains, solver=solver, guess=knots)))
     return rows
 
 

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
-from mjx_drax.solution.solution import Solution, solve
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
 from mjx_drax.studies.reproduce import settings
 from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, reaching, solve_row
 from mjx_drax.view.plotting import BLACK, BLUE, GRAY, GREEN, ORANGE
@@ -20,21 +21,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def make(chains: int = 64, iterations: int | None = None, seed: int = 0) -> tuple[Numbers, Figure]:
+def make(chains: int = 64, iterations: int | None = None) -> tuple[Numbers, Figure]:
     """Left the paper's flow, right the preconditioned one, from the same random knots.
 
     Args:
         chains: number of chains; the first is drawn, whatever became of it.
         iterations: of the paper's flow; 20,000 by default.
-        seed: of all random numbers.
     """
     problem, solvers = settings.pendulum(), settings.pendulum_flows(iterations)
-    start = settings.initial_knots(problem, chains, seed)
+    start = settings.initial_knots(problem, chains)
     figure = new_figure(8.0, 6.0)
     axes = figure.subplots(2, 2, sharex="row", sharey="row", height_ratios=(2, 1))
     rows = []
     for column, (name, solver) in enumerate(solvers.items()):
-        solution = solve(problem, chains, seed, solver, guess=start)
+        solution = solve(problem, chains, solver=solver, guess=start)
         rows.append(solve_row(name, solution))
         _draw_phase(axes[0, column], problem, jax.tree.map(lambda a: a[0], start), solution)
         _draw_controls(axes[1, column], solution)

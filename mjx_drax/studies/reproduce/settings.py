@@ -9,10 +9,10 @@ import jax
 from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Identity
-from mjx_drax.method.quasi_newton import LBFGS
 from mjx_drax.method.schedules import Constant, Geometric
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.studies.lbfgs import LBFGS
 
 # Preconditioned settings for one attempt, chosen by hand for each problem
 
@@ -84,9 +84,9 @@ def pendulum_flows(iterations: int | None) -> dict[str, Langevin]:
     return {"paper's flow": flow, "preconditioned": PENDULUM}
 
 
-def initial_knots(problem: Problem, chains: int, seed: int) -> Trajectory:
+def initial_knots(problem: Problem, chains: int) -> Trajectory:
     """The same random knots for every method, (chains, K, ...)."""
-    return jax.vmap(problem.draw)(jax.random.split(jax.random.key(seed), chains))
+    return jax.vmap(problem.draw)(jax.random.split(jax.random.key(0), chains))
 
 
 def budget_of(solver: Langevin) -> int:
