@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.cli import exports
-from mjx_drax.cli.common import say
+from mjx_drax.cli.common import Tell, say
+from mjx_drax.solution.export import Exporter, NothingToExport, exporter, exporters
+from mjx_drax.view import exporters as _more  # noqa: F401  # to import it makes its exporter known
+
+if TYPE_CHECKING:
+    from mjx_drax.solution.solution import Solution
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The folder, and the files."""
     parser.add_argument("folder", metavar="DIR", help="such as out/cartpole_swingup")
-    exports.add_arguments(parser)
+    add_flags(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the files beside the result."""
-    wanted = exports.chosen(options)
+    wanted = chosen(options)
     if not wanted:
-        flags = ", ".join(f"--{name}" for name in exports.exporters())
+        flags = ", ".join(f"--{name}" for name in exporters())
         raise DraxError(f"nothing to write: give at least one of {flags} or --export.")
     from mjx_drax.solution.save import writable
     from mjx_drax.solution.solution import Solution
@@ -28,6 +35,43 @@ def run(options: argparse.Namespace) -> int:
     for each in wanted:
         each.check(solution.problem)
     folder = writable(options.folder)
-    written = exports.write(solution, folder, wanted, say)
-    say(f"written to {folder}/: {', '.join(written)}")
+    say(f"written to {folder}/: {', '.join(write(solution, folder, wanted, say))}")
     return 0
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """A flag for every exporter, and one for the user's own; `solve` has them too."""
+    for name, each in exporters().items():
+        parser.add_argument(
+            f"--{name}",
+            dest="exports",
+            action="append_const",
+            const=name,
+            help=f"write {each.file}: {each.summary}",
+        )
+    parser.add_argument(
+        "--export",
+        dest="exports",
+        action="append",
+        metavar="MODULE:CLASS",
+        help="write with an exporter of your own, a subclass of mjx_drax.Exporter; again for more",
+    )
+    parser.set_defaults(exports=[])
+
+
+def chosen(options: argparse.Namespace) -> list[Exporter]:
+    """The exporters that are asked for, each once."""
+    return [exporter(text) for text in dict.fromkeys(options.exports)]
+
+
+def write(solution: Solution, folder: Path, wanted: Sequence[Exporter], tell: Tell) -> list[str]:
+    """Write the files that are asked for; returns their names."""
+    written = []
+    for each in wanted:
+        try:
+            each.write(solution, folder / each.file)
+        except NothingToExport as reason:
+            tell(f"{each.file} is left out: {reason}")
+        else:
+            written.append(each.file)
+    return written

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.cli import cost_file, exports, pictures
+from mjx_drax.cli import cost_file, export, pictures
 from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_nothing
 from mjx_drax.cli.progress import Bar
 
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]")
     add("--fps", type=float, metavar="N", help="frames per second")
     add("--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion")
-    exports.add_arguments(parser)
+    export.add_flags(parser)
     add(
         "--set",
         dest="settings",
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.view.video import check as require_drawing
 
     settled(problem, chains, options.seed, solver)  # refuses settings that cannot work
-    wanted = exports.chosen(options)
+    wanted = export.chosen(options)
     for each in wanted:
         each.check(problem)
     room = results.expected_size(problem, chains)
@@ -128,14 +128,14 @@ def run(options: argparse.Namespace) -> int:
         from mjx_drax.view.diffusion import render_diffusion
 
         render_diffusion(solution, film, draw=draw, **look)
-    written += exports.write(solution, folder, wanted, tell)
+    written += export.write(solution, folder, wanted, tell)
     for line in summary.lines(solution):
         tell(line)
     tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:
         tell(f"film written to {film}")
         written += [film.name] * (film.resolve().parent == folder.resolve())
-    names = (*pictures.NAMES, *(each.file for each in exports.exporters().values()))
+    names = (*pictures.NAMES, *(each.file for each in export.exporters().values()))
     older = [name for name in names if name not in written and (folder / name).exists()]
     if older:
         tell(f"there from an earlier solve: {', '.join(older)}")

@@ -31,7 +31,7 @@ import os
 import platform
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +47,7 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, as_restarts
-from mjx_drax.solution.replay import judged
+from mjx_drax.solution.replay import Replays, judged
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.many_starts import solve_each
@@ -148,7 +148,7 @@ def ours(
 ) -> Row:
     """A solve, and when its first answer was there; with probes=0, only when its last one was."""
     solution = solve(problem, chains, seed, solver, devices=devices)
-    replay = _seconds_of_a_replay(solution)
+    replay = seconds_to_replay(problem, np.asarray(solution.best.u, float))
     answers = [*_interrupted(solution, probes), _judged(solution)]
     seconds, share, close = map(list, zip(*answers, strict=True))
     times = np.maximum.accumulate(seconds) + replay  # solves are timed with some noise
@@ -215,43 +215,36 @@ def _judged(solution: Solution) -> tuple[float, float, float]:
     return solution.solve_time, solution.success_rate, float(close.mean())
 
 
-def _seconds_of_a_replay(solution: Solution) -> float:
-    """Time to replay the best chain [s], once compiled."""
-    problem, chain = solution.problem, solution.best_chain
-    plan = np.asarray(problem.with_start(solution.best), float)[None]
-    u, gains = solution.trajectories.u[chain][None], solution.gains[chain][None]
-    return _seconds(problem, plan, np.asarray(u, float), gains.astype(float))
-
-
 # Peers
 
 
-@dataclass(frozen=True)
-class Verdicts:
-    """What open-loop replays came to: success and cost, (n,) each, and the time of one [s]."""
+def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> Replays:
+    """Open-loop replays of controls (n, K, nu), judged as certificates are.
 
-    success: np.ndarray
-    cost: np.ndarray
-    seconds: float
+    Args:
+        problem: for its engine, goal and bounds.
+        u: the controls.
+        x_init: where each replay starts, (n, nx); by default the problem's for all.
+    """
+    ran = _replayed(problem, u, x_init)
+    values = Family.of_one(problem).cost_and_violation
+    return judged(problem, ran[0], ran, values)  # as if what happened had been planned
 
 
-def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> Verdicts:
-    """Replay controls (n, K, nu) from x_init, the problem's or (n, nx), as certificates do."""
+def _replayed(
+    problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """States and controls of open-loop replays of controls (n, K, nu)."""
     plan = np.zeros((len(u), problem.horizon + 1, problem.dynamics.nx))
     plan[:, 0] = np.asarray(problem.x_init, float) if x_init is None else x_init
-    gains = np.zeros((*u.shape, problem.dynamics.ndx))
-    ran = problem.replay(plan, u, gains)
-    values = Family.of_one(problem).cost_and_violation
-    replays = judged(problem, ran[0], ran, values)  # as if what happened had been planned
-    seconds = _seconds(problem, plan[:1], u[:1], gains[:1])
-    return Verdicts(replays.success, replays.cost, seconds)
+    return problem.replay(plan, u, np.zeros((*u.shape, problem.dynamics.ndx)))
 
 
-def _seconds(problem: Problem, plan: np.ndarray, u: np.ndarray, gains: np.ndarray) -> float:
-    """Time of a replay [s], once compiled."""
+def seconds_to_replay(problem: Problem, u: np.ndarray) -> float:
+    """Time of a replay of controls (K, nu) [s], once compiled."""
     for _ in range(2):  # the first compiles
         clock = time.perf_counter()
-        problem.replay(plan, u, gains)
+        _replayed(problem, u[None])
     return time.perf_counter() - clock
 
 
@@ -286,7 +279,7 @@ def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | Non
         compile_time_s=building,
         solve_time_s=float(times[-1]),
         **over_time(
-            (times + verdicts.seconds).tolist(),
+            (times + seconds_to_replay(problem, found[0].u)).tolist(),
             (np.cumsum(success) / starts).tolist(),
             (np.cumsum(success & near(problem, costs)) / starts).tolist(),
         ),
@@ -299,7 +292,8 @@ def shoot(
     """A shooting method with a budget of evaluations of f, spent on independent runs."""
     result = shooting.optimize(method, problem, runs, samples, budget, seed)
     reports = len(result.seconds)
-    verdicts = judge(problem, result.u.reshape(-1, *result.u.shape[2:]))
+    u = result.u.reshape(-1, *result.u.shape[2:])
+    verdicts, times = judge(problem, u), result.seconds + seconds_to_replay(problem, u[0])
     certified = verdicts.success
     eligible = certified if certified.any() else np.isfinite(verdicts.cost)
     cost = np.where(eligible, verdicts.cost, np.inf).min()
@@ -321,7 +315,7 @@ def shoot(
         evaluations=result.evaluations,
         compile_time_s=result.compile_time,
         solve_time_s=float(result.seconds[-1]),
-        **over_time((result.seconds + verdicts.seconds).tolist(), share.tolist(), close.tolist()),
+        **over_time(times.tolist(), share.tolist(), close.tolist()),
     )
 
 

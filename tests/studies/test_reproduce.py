@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import Constant
+from mjx_drax import Constant, tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import main
 from mjx_drax.studies import reproduce
@@ -100,7 +100,7 @@ def test_parallel_table_solves_a_problem_for_each_initial_state():
 
 
 def test_batched_problems_start_where_they_should():
-    problem = settings.pendulum()
+    problem = tasks.load("pendulum").make()
     starts = jnp.array([[3.1, 0.0], [3.0, 0.2], [-3.1, 0.0], [3.2, -0.1]])
     keys = jax.random.split(jax.random.key(0), 4)
     knots, info, *_ = solve_each(settings.PENDULUM, problem, starts, keys)

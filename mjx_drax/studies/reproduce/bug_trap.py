@@ -34,7 +34,7 @@ def make(
         iterations: the budget; that of the preconditioned settings by default.
         longer: factor of the second budget.
     """
-    problem = settings.bug_trap()
+    problem = tasks.load("bug_trap").make()
     budget = iterations or settings.budget_of(settings.TRAP)
     solvers = _methods(budget, longer)
     start = settings.initial_knots(problem, chains)

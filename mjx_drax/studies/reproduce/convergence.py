@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from matplotlib.figure import Figure
 
+from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Constant
 from mjx_drax.problem.problem import Problem
@@ -38,7 +39,7 @@ def make(
         iterations: 20,000 by default.
         penalties: values of mu.
     """
-    problem = settings.pendulum()
+    problem = tasks.load("pendulum").make()
     flow = settings.pendulum_flows(iterations)["paper's flow"]
     total, usual = int(flow.iterations), float(np.asarray(flow.step_size))
     stops = np.unique(np.linspace(0, total, 201).round().astype(int))

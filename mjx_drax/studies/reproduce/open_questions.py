@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
+from mjx_drax import tasks
 from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Diagonal
@@ -89,7 +90,7 @@ def _compare_metrics(solvers: dict[str, Langevin], chains: int, limit: int) -> l
 
     Each metric anneals over its whole budget, so a row is a complete solve, not a point of one.
     """
-    problem = settings.pendulum()
+    problem = tasks.load("pendulum").make()
     knots, rows = initial_knots(problem, chains), []
     for name, solver in solvers.items():
         budget, median = 0, np.inf
@@ -122,7 +123,7 @@ RULES: dict[str, Rule] = {
 
 def _compare_annealing(solver: Langevin, chains: int) -> tuple[list[Numbers], dict[str, Numbers]]:
     """The bug trap under every rule: rows, and the values of sigma."""
-    problem = settings.bug_trap()
+    problem = tasks.load("bug_trap").make()
     rows, sigmas = [], {}
     for name, rule in RULES.items():
         trajectory, stops, values = _annealed(solver, problem, chains, rule)
@@ -169,7 +170,7 @@ def _annealed(
 
 def _compare_gradients(chains: int, pairs: Sequence[int]) -> list[Numbers]:
     """The pendulum with exact derivatives, and with those estimated from function values alone."""
-    problem = settings.pendulum()
+    problem = tasks.load("pendulum").make()
     choices = {"exact": GaussNewton(Autodiff())}
     choices |= {f"{n} pairs a knot": GaussNewton(Smoothed(n)) for n in pairs}
     knots, rows = initial_knots(problem, chains), []

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from matplotlib.figure import Figure
 
+from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.iterate import FEASIBLE
@@ -43,7 +44,7 @@ def make(
         iterations: of the paper's flow; 20,000 by default.
         sizes: values of N.
     """
-    problem, solvers = settings.pendulum(), settings.pendulum_flows(iterations)
+    problem, solvers = tasks.load("pendulum").make(), settings.pendulum_flows(iterations)
     sizes = [n for n in sizes if chains is None or n <= chains] or [min(sizes)]
     rows, key = [], jax.random.key(0)
     for size, kind in product(sizes, STARTS):

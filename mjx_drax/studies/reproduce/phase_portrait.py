@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from mjx_drax import tasks
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.solution.solution import Solution
@@ -28,7 +29,7 @@ def make(chains: int = 64, iterations: int | None = None) -> tuple[Numbers, Figu
         chains: number of chains; the first is drawn, whatever became of it.
         iterations: of the paper's flow; 20,000 by default.
     """
-    problem, solvers = settings.pendulum(), settings.pendulum_flows(iterations)
+    problem, solvers = tasks.load("pendulum").make(), settings.pendulum_flows(iterations)
     start = settings.initial_knots(problem, chains)
     figure = new_figure(8.0, 6.0)
     axes = figure.subplots(2, 2, sharex="row", sharey="row", height_ratios=(2, 1))

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import jax
 
-from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Identity
 from mjx_drax.method.schedules import Constant, Geometric
@@ -64,18 +63,6 @@ TRAP_QUASI_NEWTON = replace(
 """The method of multipliers with L-BFGS and a line search."""
 
 NO_NOISE = Geometric(0.0, 0.0)  # not Constant(0.0), which would compile everything once more
-
-
-def pendulum() -> Problem:
-    """The paper's pendulum."""
-    problem: Problem = tasks.load("pendulum").make()
-    return problem
-
-
-def bug_trap() -> Problem:
-    """The paper's bug trap."""
-    problem: Problem = tasks.load("bug_trap").make()
-    return problem
 
 
 def pendulum_flows(iterations: int | None) -> dict[str, Langevin]:
