@@ -1,5 +1,7 @@
 # The public names, once: `__init__` reads them from here and loads each when it is first used.
 
+from . import models as models
+from . import tasks as tasks
 from .base.errors import DraxError as DraxError
 from .base.pytrees import register_dataclass as register_dataclass
 from .base.version import __version__ as __version__

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields, is_dataclass, replace
+from copy import copy
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import jax
@@ -58,12 +59,11 @@ def register_dataclass(cls: Class) -> Class:
 
 def with_host_fields(node: Node, like: Node) -> Node:
     """The node with the `HostOnly` fields of another one of its kind, those inside it included."""
-    changed: dict[str, Any] = {}
+    new = copy(node)
     for field in fields(node):  # type: ignore[arg-type]
         mine, other = getattr(node, field.name), getattr(like, field.name)
         if field.metadata.get("host"):
-            changed[field.name] = other
+            object.__setattr__(new, field.name, other)
         elif is_dataclass(mine) and type(mine) is type(other):
-            inner = with_host_fields(mine, other)
-            changed |= {} if inner is mine else {field.name: inner}
-    return replace(node, **changed) if changed else node  # type: ignore[type-var]
+            object.__setattr__(new, field.name, with_host_fields(mine, other))
+    return new

@@ -435,7 +435,7 @@ def _plan(
     state = _led_back(flow, problem, state, carried)
     total = jnp.int32(flow.iterations + flow.tail)
     start = jnp.where(exploring, age, total - iterations)
-    state = _iterated(flow, heated, problem, state, exploring, start, iterations)
+    state = _iterated(flow, heated, problem, state, exploring, start, iterations, explorers > 0)
     age = jnp.where(exploring & (age + iterations < CYCLE), age + iterations, 0)
     info = evaluate(problem, state.trajectory)
     alive = state.alive & jnp.isfinite(info.cost) & jnp.isfinite(info.max_defect)
@@ -525,6 +525,7 @@ def _iterated(
     exploring: Array,
     start: Array,
     iterations: Array,
+    noise: bool,
 ) -> State:
     """So many iterations of every chain, from its own `start` (chains,) in its own schedules."""
 
@@ -536,4 +537,4 @@ def _iterated(
     sizes = [len(jax.tree.leaves(part)) for part in question]
     differs = (True,) * sizes[0] + (False,) * sizes[1] + (True,)
     shared, rows = partition(question, differs)
-    return loop((state, rows), shared, 0, iterations, diagnose=False)[0]
+    return loop((state, rows), shared, 0, iterations, noise=noise, diagnose=False)[0]

@@ -14,6 +14,7 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxError, is_number, require_not_negative, require_positive, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import index
 from mjx_drax.physics.states import Floats, integrate, set_state
@@ -71,15 +72,15 @@ class Plant:
         Raises:
             DraxError: a problem without a model, an unknown body, numbers that make no sense.
         """
-        dynamics = problem.dynamics
-        if not hasattr(dynamics, "mj_model"):
+        model = mujoco_model(problem.dynamics)
+        if model is None:
             raise DraxError(f"{problem.name} has no model to simulate: use from_mjcf.")
         require_not_negative("noise", noise)
         require_not_negative("shaking", shaking)
         require_positive("mass", mass, "a positive factor, 1 for no error")
         for push in pushes:
             _require_push(push)
-        self.model: mujoco.MjModel = copy.copy(dynamics.mj_model)
+        self.model: mujoco.MjModel = copy.copy(model)
         self.model.body_mass[:] *= mass
         self.model.body_inertia[:] *= mass
         self.data = mujoco.MjData(self.model)

@@ -1,3 +1,4 @@
-"""The method of the paper. Read: schedules, model, bounds, metrics, riccati, gauss_newton,
-descent, langevin.
+"""The method of the paper, equations only.
+
+Read schedules, model, bounds, metrics, riccati, gauss_newton, descent, langevin.
 """

@@ -1,9 +1,9 @@
-"""The noise-free tail: a line search on L_mu, damping that adapts, multipliers of the bounds.
+"""What a chain takes of a direction: line search, Metropolis test, damping, bounds' multipliers.
 
-With Gauss-Newton this is sequential quadratic programming, and it is what brings max|h| to rounding
-level. The step size is the one that lowers L_mu most, from a short geometric ladder evaluated in one
-batch. Each chain adapts its damping as Levenberg and Marquardt do, less after a full step and more
-after a short one.
+With Gauss-Newton the noise-free tail is sequential quadratic programming, and it is what brings
+max|h| to rounding level. The step size is the one that lowers L_mu most, from a short geometric
+ladder evaluated in one batch. Each chain adapts its damping as Levenberg and Marquardt do, less
+after a full step and more after a short one.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def adapted(
     new: Any,
     size: Array,
     weights: Weights,
-    noisy: Array,
+    noisy: ArrayLike,
 ) -> Any:
     """A chain's new State with the damping and bounds' multipliers that an iteration leaves.
 

@@ -18,6 +18,7 @@ nears zero. Given dz, ds has variance 1/D under N(0, M^{-1}).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -62,33 +63,34 @@ class GaussNewton(Metric):
         """Drift, noise and multiplier rate, from one factorization; with feedback gains."""
         derivatives, weights, multipliers = model.derivatives, model.weights, model.multipliers
         assert derivatives is not None  # for the type checker
-        of_states = model.state_damping if self.state_damping is None else self.state_damping
+        given = self.state_damping
+        of_states = problem.dynamics.state_damping if given is None else given
         cost = _with_barrier(derivatives.cost, *model.barrier, weights.damping, of_states)
         cost, stages, end = _with_constraints(cost, derivatives, model)
-        whites = _white(problem, stages, end, key)
-        white, slack_white = drawn(noisy, whites, jax.eval_shape(whites))
+        white, slack_white = None, None
+        if noisy is not False:
+            draw = _white(problem, stages, end, key)
+            white, slack_white = drawn(noisy, draw, jax.eval_shape(draw))
         step = newton(derivatives.dynamics, cost, multipliers.dynamics, weights.penalty, white)
-
-        def back(block: Eliminated, dz: Array, nz: Array, xi: Array) -> Any:
-            return recover(block, dz, nz, xi, weights.penalty)
-
-        dz, nz = _stage_steps(step.dx, step.du), _stage_steps(step.nx, step.nu)
-        ds, ns, rate = jax.vmap(back)(stages, dz, nz, slack_white[0])
-        ds_end, ns_end, rate_end = back(end, step.dx[-1], step.nx[-1], slack_white[1])
-        has_slack = model.gradient.slack is not None
-        return Direction(
-            Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if has_slack else None),
-            Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if has_slack else None),
-            Multipliers(step.rate, Stagewise(rate, rate_end)),
-            step.K,
-            memory,
-        )
+        slack = model.gradient.slack
+        dz, mu = (_stage_steps(step.dx, step.du), step.dx[-1]), weights.penalty
+        ds, rate = jax.vmap(partial(slack_step, penalty=mu))(stages, dz[0])
+        ds_end, rate_end = slack_step(end, dz[1], mu)
+        drift = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if slack else None)
+        noise = problem.no_change(model.trajectory)
+        if slack_white is not None:
+            nz = _stage_steps(step.nx, step.nu), step.nx[-1]
+            ns = jax.vmap(partial(slack_noise, penalty=mu))(stages, nz[0], slack_white[0])
+            ns_end = slack_noise(end, nz[1], slack_white[1], mu)
+            noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None)
+        rates = Multipliers(step.rate, Stagewise(rate, rate_end))
+        return Direction(drift, noise, rates, step.K, memory)
 
 
 @register_dataclass
 @dataclass(frozen=True)
 class Eliminated:
-    """What `recover` needs of one knot: J (m, n), r (m,), t (mg,) and D (mg,)."""
+    """What slacks are recovered from, at one knot: J (m, n), r (m,), t (mg,) and D (mg,)."""
 
     J: Array
     r: Array
@@ -110,15 +112,17 @@ def eliminate(
     return gradient, transposed_product(J, weights[:, None] * J), Eliminated(J, r, t, D)
 
 
-def recover(
-    block: Eliminated, dz: Array, nz: Array, white: Array, penalty: Array
-) -> tuple[Array, Array, Array]:
-    """Slack step ds (mg,), slack noise (mg,) and mu (r + J d) (m,), given dz and nz (n,)."""
+def slack_step(block: Eliminated, dz: Array, penalty: Array) -> tuple[Array, Array]:
+    """Slack step ds (mg,) and mu (r + J d) (m,), given dz (n,)."""
     equalities = block.r.shape[0] - block.t.shape[0]
-    G = block.J[equalities:]
-    ds = -(block.t + penalty * (G @ dz)) / block.D
-    ns = -penalty * (G @ nz) / block.D + white / jnp.sqrt(block.D)
-    return ds, ns, penalty * (block.r + block.J @ dz).at[equalities:].add(ds)
+    ds = -(block.t + penalty * (block.J[equalities:] @ dz)) / block.D
+    return ds, penalty * (block.r + block.J @ dz).at[equalities:].add(ds)
+
+
+def slack_noise(block: Eliminated, nz: Array, white: Array, penalty: Array) -> Array:
+    """Slack noise (mg,), given nz (n,) and standard normal numbers (mg,)."""
+    G = block.J[block.r.shape[0] - block.t.shape[0] :]
+    return -penalty * (G @ nz) / block.D + white / jnp.sqrt(block.D)
 
 
 def _with_barrier(

@@ -112,17 +112,14 @@ class Langevin:
     def init(self, problem: Problem, trajectory: Trajectory, key: Array) -> State:
         """The first state of a chain that starts at the given knots, (K, nx) and (K, nu)."""
         K, nu, ndx = problem.horizon, problem.dynamics.nu, problem.dynamics.ndx
-        m, m_end = (
-            c.equalities + c.inequalities for c in (problem.constraint, problem.terminal_constraint)
-        )
-        knots = self.inside(problem, trajectory)
-        weights = self.weights(0.0)
+        stage, end = problem.constraint, problem.terminal_constraint
+        knots, rho = self.inside(problem, trajectory), self.weights(0.0).barrier
         return State(
             trajectory=knots,
             multipliers=Multipliers(
                 jnp.zeros((K, ndx)),
-                Stagewise(jnp.zeros((K, m)), jnp.zeros(m_end)),
-                self.bounds.multipliers(problem.bounds, knots, weights.barrier),
+                Stagewise(jnp.zeros((K, stage.rows)), jnp.zeros(end.rows)),
+                self.bounds.multipliers(problem.bounds, knots, rho),
             ),
             damping=jnp.ones(()),
             gains=jnp.zeros((K, nu, ndx)),
@@ -134,15 +131,9 @@ class Langevin:
 
     def inside(self, problem: Problem, trajectory: Trajectory) -> Trajectory:
         """The knots inside the bounds, with slacks that satisfy g + s = 0 where g <= 0."""
-        stage, terminal = problem.constraint, problem.terminal_constraint
-        if stage.inequalities + terminal.inequalities:
-            g = problem.constraints(trajectory)
-            slack = Stagewise(
-                jnp.maximum(-g.stage[:, stage.equalities :], SLACK),
-                jnp.maximum(-g.terminal[terminal.equalities :], SLACK),
-            )
-            trajectory = replace(trajectory, slack=slack)
-        return self.bounds.interior(problem.bounds, trajectory)
+        g = problem.inequalities(trajectory)
+        slack = jax.tree.map(lambda g: jnp.maximum(-g, SLACK), g)
+        return self.bounds.interior(problem.bounds, replace(trajectory, slack=slack))
 
     def step(
         self,
@@ -150,6 +141,7 @@ class Langevin:
         state: State,
         iteration: ArrayLike,
         tail: bool = True,
+        noise: bool = True,
         moves: Array | None = None,
     ) -> tuple[State, Info]:
         """One iteration, and diagnostics of where it ends.
@@ -158,8 +150,8 @@ class Langevin:
             problem: the problem.
             state: the chain.
             iteration: from 0; the schedules are read there, traced.
-            tail: False leaves out the noise-free tail, which is then never reached (static). A GPU
-                waits for the choice between the two.
+            tail, noise: False leaves out the noise-free tail, or the iterations with noise, which
+                are then never reached (static). A GPU waits for the choice between the two.
             moves: where this traced truth value is False, the chain stands still and is diagnosed;
                 given so, both take one copy of f in a compiled program.
 
@@ -167,7 +159,7 @@ class Langevin:
             the state, and diagnostics from the line search; zeros from steps with noise.
         """
         iteration = jnp.asarray(iteration)
-        noisy = iteration < self.iterations
+        noisy = iteration < self.iterations if noise else False
         noisy = noisy if moves is None else noisy & moves
         weights = self.weights(self.progress(iteration, noisy))
         key = jax.random.fold_in(state.key, iteration)
@@ -183,7 +175,10 @@ class Langevin:
 
         directed = partial(self._direction, problem, state, weights, noisy, key, tail)
         to = directed() if moves is None else where_needed(moves, directed)
-        X, size, info = jax.lax.cond(noisy, diffuse, descend) if tail else diffuse()
+        if tail and noise:
+            X, size, info = jax.lax.cond(noisy, diffuse, descend)
+        else:
+            X, size, info = diffuse() if noise else descend()
         alpha = jnp.ones_like(size) if self.preconditioner.full_multiplier_steps else size
         lambda_ = jax.tree.map(
             lambda m, r: m + alpha * r, replace(state.multipliers, bounds=None), to.multipliers
@@ -209,7 +204,7 @@ class Langevin:
         problem: Problem,
         state: State,
         weights: Weights,
-        noisy: Array,
+        noisy: Array | bool,
         key: Array,
         tail: bool,
     ) -> Direction:

@@ -103,6 +103,8 @@ def white(like: Trajectory, key: Array) -> Trajectory:
 
 def drawn(noisy: Array | bool, draw: Callable[[], Any], like: Any) -> Any:
     """draw() where `noisy`, else zeros in the shape of `like`."""
+    if noisy is False:
+        return jax.tree.map(jnp.zeros_like, like)
     return jax.lax.cond(noisy, draw, lambda: jax.tree.map(jnp.zeros_like, like))
 
 
@@ -145,6 +147,7 @@ class Diagonal(Metric):
 
 def _diagonal(model: Model) -> Trajectory:
     """The diagonal of H + mu J'J, in the shape of a trajectory."""
+    assert model.derivatives is not None  # for the type checker
     dynamics, cost, stage, terminal = model.derivatives
     penalty, ndx = model.weights.penalty, dynamics.h.shape[-1]
     squares = jnp.sum(jnp.square(stage), axis=1)

@@ -63,11 +63,10 @@ class QuadraticCost:
 
 
 class Derivatives(NamedTuple):
-    """At every knot: of the dynamics, the costs, and the constraints.
+    """Of dynamics, costs and constraints at every knot.
 
     Attributes:
-        dynamics: A, B and h.
-        cost: gradients, and semidefinite Hessians.
+        dynamics, cost: their models.
         stage: Jacobian of the constraints in (dx, du), (K, m, ndx + nu).
         terminal: Jacobian of the terminal constraints in dx, (m_end, ndx).
     """
@@ -90,10 +89,8 @@ class Model:
         multipliers: lambda, and those of bounds.
         weights: sigma, mu, delta, rho.
         barrier: gradient and diagonal curvature of rho b, shaped like the knots.
-        state_damping: damping of states beside that of controls.
 
-        derivatives: of dynamics, costs and constraints at every knot; None where the metric asked
-            for none.
+        derivatives: at every knot; None where the metric asked for none.
     """
 
     trajectory: Trajectory
@@ -102,7 +99,6 @@ class Model:
     multipliers: Multipliers
     weights: Weights
     barrier: tuple[Trajectory, Trajectory]
-    state_damping: float
     derivatives: Derivatives | None = None
 
 
@@ -119,8 +115,8 @@ def expand(
 
     Without `by` only the gradient is made, by one reverse-mode derivative of L_mu.
     """
-    box, damping = problem.bounds, problem.dynamics.state_damping
-    slope, curvature = bounds.derivatives(box, trajectory, weights.barrier, multipliers.bounds)
+    present = problem.bounds, trajectory, weights.barrier, multipliers.bounds
+    slope, curvature = bounds.derivatives(*present)
     tangent = problem.dynamics.tangent
     barrier = replace(slope, x=tangent(slope.x)), replace(curvature, x=tangent(curvature.x))
     if by is None:
@@ -129,10 +125,11 @@ def expand(
             moved = problem.displaced(trajectory, change)
             return jnp.sum(penalized(problem, moved, problem.values(moved), multipliers, weights))
 
-        slope = jax.tree.map(jnp.add, jax.grad(merit)(problem.no_change(trajectory)), barrier[0])
+        gradient = jax.grad(merit)(problem.no_change(trajectory))
+        slope = jax.tree.map(jnp.add, gradient, barrier[0])
         constraints = problem.with_slack(problem.constraints(trajectory), trajectory.slack)
         h = Multipliers(problem.defects(trajectory), constraints)
-        return Model(trajectory, slope, h, multipliers, weights, barrier, damping)
+        return Model(trajectory, slope, h, multipliers, weights, barrier)
 
     keys = jax.random.split(key, problem.horizon + 1)
     dynamics = linearize(problem, trajectory, by, keys[:-1])
@@ -141,7 +138,7 @@ def expand(
     derivatives = Derivatives(dynamics, cost, stage, terminal)
     slope = _gradient(trajectory, multipliers, weights, derivatives, h)
     slope = jax.tree.map(jnp.add, slope, barrier[0])
-    return Model(trajectory, slope, h, multipliers, weights, barrier, damping, derivatives)
+    return Model(trajectory, slope, h, multipliers, weights, barrier, derivatives)
 
 
 def linearize(
@@ -179,8 +176,7 @@ def _expand_costs(
         )
 
     def end(dx: Array) -> tuple[Any]:
-        moved = dynamics.integrate(trajectory.x[-1], dx)
-        return (dynamics.observe(moved, jnp.zeros(nu)),)
+        return (dynamics.observe(dynamics.integrate(trajectory.x[-1], dx), jnp.zeros(nu)),)
 
     (g, H), (J, values) = jax.vmap(stage)(problem.stages(trajectory), trajectory.u, keys[:-1])
     g_end, H_end = problem.terminal.expand(end, ndx, by, keys[-1])
@@ -204,15 +200,13 @@ def _gradient(
 ) -> Trajectory:
     """grad c + J'(lambda + mu h), knot by knot."""
     dynamics, cost, stage, terminal = derivatives
-    ndx = dynamics.h.shape[-1]
-    present = replace(multipliers, bounds=None)
-    force = jax.tree.map(lambda m, r: m + weights.penalty * r, present, h)  # lambda + mu h
+    ndx, present = dynamics.h.shape[-1], replace(multipliers, bounds=None)
+    force = jax.tree.map(lambda m, r: m + weights.penalty * r, present, h)
     of_stage = jnp.einsum("kij,ki->kj", stage, force.constraints.stage)
     gx = cost.gx.at[:-1].add(of_stage[:, :ndx])
     gx = gx.at[-1].add(terminal.T @ force.constraints.terminal)
     gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", dynamics.A, force.dynamics))
-    gu = cost.gu + of_stage[:, ndx:]
-    gu = gu + jnp.einsum("kij,ki->kj", dynamics.B, force.dynamics)
+    gu = cost.gu + of_stage[:, ndx:] + jnp.einsum("kij,ki->kj", dynamics.B, force.dynamics)
     slack = None
     if trajectory.slack is not None:  # h = g + s: the rows of inequalities, the last ones
         rows, sizes = force.constraints, trajectory.slack
@@ -228,7 +222,7 @@ def augmented_lagrangian(
     weights: Weights,
     values: Values,
 ) -> Array:
-    """L_mu as one term per stage, (K + 1,), for a trajectory and the functions' values there.
+    """L_mu as one term per stage, (K + 1,), of a trajectory where functions have these values.
 
     Two trajectories are compared by summing the differences of their terms, which keeps far more
     digits in float32 than the difference of their sums.

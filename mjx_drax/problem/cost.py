@@ -107,6 +107,11 @@ class Constraint:
         parts = [p for p in (self.equality, self.inequality) if p is not None]
         return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
 
+    @property
+    def rows(self) -> int:
+        """Of both parts."""
+        return self.equalities + self.inequalities
+
     def with_slack(self, values: Array, slack: Array) -> Array:
         """The equality constraints [equality; inequality + slack], for values (..., m)."""
         inequality = values[..., self.equalities :] + slack

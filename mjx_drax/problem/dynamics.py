@@ -5,8 +5,8 @@ numbers; on a vector space the two are the same. Everything that is solved for (
 linearizations, multipliers, noise) lives in tangent space.
 
 A system of your own is a frozen dataclass under `mjx_drax.register_dataclass` with the fields `dt`,
-`nx` and `nu` and one method, `step`; one whose states are no vectors (angles that wrap, quaternions)
-brings three, `step`, `difference` and `integrate`, and `ndx`. The rest has defaults.
+`nx` and `nu` and one method, `step`. One whose states are no vectors (angles that wrap,
+quaternions) brings three, `step`, `difference` and `integrate`, and `ndx`. The rest has defaults.
 """
 
 from __future__ import annotations

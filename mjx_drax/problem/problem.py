@@ -132,6 +132,14 @@ class Problem:
         stages = jax.vmap(self.running_constraint)(self.stages(trajectory), trajectory.u)
         return Stagewise(stages, self.end_constraint(trajectory.x[-1]))
 
+    def inequalities(self, trajectory: Trajectory) -> Stagewise | None:
+        """g at the stages (K, mg) and at the end (mg_end,); None if the problem has no g."""
+        stage, end = self.constraint, self.terminal_constraint
+        if stage.inequalities + end.inequalities == 0:
+            return None
+        values = self.constraints(trajectory)
+        return Stagewise(values.stage[:, stage.equalities :], values.terminal[end.equalities :])
+
     def with_slack(self, values: Stagewise, slack: Stagewise | None) -> Stagewise:
         """The equality constraints [equality; inequality + slack], if there are slacks."""
         if slack is None:

@@ -459,10 +459,10 @@ class Search:
         problem, knots = self.family.problem, chains.state.trajectory
         rows = self.family.rows(self.indices, self.chains)
         gains, dtype = with_feedback * np.asarray(chains.state.gains), knots.x.dtype
-        start = jnp.broadcast_to(rows.x_init, (len(knots.x), problem.dynamics.nx))
-        plan = jnp.concatenate([start[:, None], knots.x], axis=1)
+        start = np.broadcast_to(rows.x_init, (len(knots.x), problem.dynamics.nx))
+        plan = np.concatenate([start[:, None], knots.x], axis=1)
         indices = np.repeat(self.indices, self.chains)
-        states, controls = self.family.replay(indices, plan, knots.u, gains)
+        states, controls = self.family.replay(indices, plan, np.asarray(knots.u), gains)
         rolled = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
@@ -612,12 +612,12 @@ def _slim(chains: Chains) -> Chains:
 def _unset(like: Chains, rows: int) -> Chains:
     """Places on the host for the best of so many chains, infinitely bad so far."""
     empty: Chains = jax.tree.map(lambda a: np.zeros((rows, *a.shape[1:]), a.dtype), _slim(like))
-    worst = Info(*(np.full(rows, np.inf) for _ in range(3)))
+    worst: Any = Info(*[np.full(rows, np.inf)] * 3)  # type: ignore[arg-type]
     return replace(empty, info=worst, feasible_since=np.full(rows, -1))
 
 
 def _owners(done: np.ndarray) -> np.ndarray:
-    """For which chain each place of a problem works: those that are not done, in turn, (chains,)."""
+    """For which chain each place works: those that are not done, in turn, (chains,)."""
     return np.resize(np.flatnonzero(~done) if not done.all() else [0], len(done))
 
 

@@ -114,13 +114,14 @@ def loop(
     start: ArrayLike,
     stop: ArrayLike,
     tail: bool = True,
+    noise: bool = True,
     diagnose: bool = True,
 ) -> tuple[State, Any]:
     """`iterate`, inside of a compiled function; without diagnostics if not asked to `diagnose`."""
     states, own = rows
 
     def one(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
-        return q.flow.step(q.problem, state, i + q.offset, tail, moves)
+        return q.flow.step(q.problem, state, i + q.offset, tail, noise, moves)
 
     if diagnose and tail and shared.problem.dynamics.kinked:
 
@@ -197,7 +198,7 @@ def noise_at(flow: Langevin, iteration: int) -> float:
 
 
 def start(flow: Langevin, problem: Problem, knots: Trajectory, key: Array) -> State:
-    """Chains of one problem at given knots (chains, K, ...); chain c has the key fold_in(key, c)."""
+    """Chains of one problem at knots (chains, K, ...); chain c has the key fold_in(key, c)."""
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(len(knots.u)))
     shared, own = partition(Question(flow, problem), None)
     return begin(own, shared, knots, keys)

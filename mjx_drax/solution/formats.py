@@ -177,11 +177,6 @@ def _numbers(values: npt.ArrayLike) -> str:
 # Datasets
 
 
-def require_h5py() -> None:
-    """Complain if `save_dataset` cannot work; call it before a long computation."""
-    require("h5py", "dataset", "a dataset")
-
-
 def save_dataset(
     solutions: Solution | Sequence[Solution],
     path: str | os.PathLike[str],
@@ -205,7 +200,7 @@ def save_dataset(
     Raises:
         DraxError: h5py is not installed, nothing is certified, or the path cannot be written.
     """
-    require_h5py()
+    require("h5py", "dataset", "a dataset")
     import h5py
 
     solutions = [solutions] if isinstance(solutions, Solution) else list(solutions)
