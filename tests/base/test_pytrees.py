@@ -7,7 +7,8 @@ import pytest
 
 from mjx_drax import Projection, Reflection
 from mjx_drax.base.pytrees import Static, register_dataclass
-from mjx_drax.problem.dynamics import FunctionDynamics, as_partial
+from mjx_drax.problem.cost import as_partial
+from mjx_drax.problem.dynamics import FunctionDynamics
 
 
 @register_dataclass

@@ -19,7 +19,7 @@ from mjx_drax import (
     solve,
 )
 from mjx_drax.method.bounds import FOLLOW
-from mjx_drax.problem.problem import Box, box
+from mjx_drax.problem.trajectory import Box, box
 
 K, NX, NU = 5, 3, 2
 INF = np.inf
@@ -161,9 +161,11 @@ def test_derivatives_stay_finite_on_and_beyond_the_bounds():
 
 def test_interior_is_the_nearest_point_a_margin_away():
     z = Trajectory(jnp.full((K, NX), 9.0), jnp.full((K, NU), -9.0))
-    moved = BARRIER.interior(BOUNDS, z, margin=0.1)
-    np.testing.assert_allclose(moved.x, np.tile([2 - 0.3, 0.5 - 0.1, 9.0], (K, 1)), rtol=1e-6)
-    np.testing.assert_allclose(moved.u, np.tile([0.1, -9.0], (K, 1)), rtol=1e-6)
+    moved = BARRIER.interior(
+        BOUNDS, z
+    )  # the margin is 1 % of a width, or 0.01 where one end is free
+    np.testing.assert_allclose(moved.x, np.tile([2 - 0.03, 0.5 - 0.01, 9.0], (K, 1)), rtol=1e-6)
+    np.testing.assert_allclose(moved.u, np.tile([0.01, -9.0], (K, 1)), rtol=1e-6)
     np.testing.assert_array_equal(flat(BARRIER.interior(BOUNDS, inside())), flat(inside()))
 
 

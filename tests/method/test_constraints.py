@@ -12,15 +12,12 @@ from jax.tree_util import Partial
 
 from mjx_drax import Constant, GaussNewton, Langevin, LogBarrier, Trajectory, from_function, solve
 from mjx_drax.method.bounds import Projection
-from mjx_drax.method.constraints import eliminate, recover
-from mjx_drax.method.langevin import advance
-from mjx_drax.method.metrics import (
-    Levels,
-    Multipliers,
-    augmented_lagrangian,
-    residuals,
-)
-from mjx_drax.problem.problem import Stagewise
+from mjx_drax.method.gauss_newton import eliminate, slack_noise, slack_step
+from mjx_drax.method.model import Multipliers, augmented_lagrangian, expand
+from mjx_drax.method.schedules import Weights
+from mjx_drax.problem.differentiators import Autodiff
+from mjx_drax.problem.trajectory import Stagewise
+from mjx_drax.search import iterate
 from mjx_drax.solution.program import from_program, minimize
 
 
@@ -52,7 +49,8 @@ def test_elimination_is_the_schur_complement(equalities, inequalities):
 
     step = -np.linalg.solve(M, full)
     dz, nz, white = step[:n], rng.normal(size=n), rng.normal(size=inequalities)
-    ds, ns, rate = recover(block, *map(jnp.asarray, (dz, nz, white)), mu)
+    ds, rate = slack_step(block, jnp.asarray(dz), mu)
+    ns = slack_noise(block, jnp.asarray(nz), jnp.asarray(white), mu)
     np.testing.assert_allclose(ds, step[n:], atol=1e-12)
     np.testing.assert_allclose(rate, mu * (r + whole @ step), atol=1e-11)
     # under N(0, M^-1), given nz: mean -ss^-1 sz nz and covariance ss^-1
@@ -62,10 +60,7 @@ def test_elimination_is_the_schur_complement(equalities, inequalities):
 
 K, NX, NU = 3, 2, 2
 RATE = np.array([[0.9, 0.3], [-0.2, 1.0]])
-LEVELS = Levels(*map(jnp.asarray, (0.5, 5.0, 0.2, 0.3)))  # sigma, mu, delta, rho
-
-
-BARRIER = 0
+WEIGHTS = Weights(*map(jnp.asarray, (0.5, 5.0, 0.2, 0.3)))  # sigma, mu, delta, rho
 
 
 def bent(bend, x, u):
@@ -133,19 +128,34 @@ def dense(problem, trajectory, multipliers):
     point, unravel = ravel_pytree(trajectory)
 
     def lagrangian(p):
-        return augmented_lagrangian(problem, LogBarrier(), unravel(p), multipliers, LEVELS).sum()
+        z = unravel(p)
+        values = problem.values(z)
+        return augmented_lagrangian(problem, LogBarrier(), z, multipliers, WEIGHTS, values).sum()
 
     def h(p):
-        defects, values = residuals(problem, unravel(p))
-        return ravel_pytree(Multipliers(defects, values))[0]
+        z = unravel(p)
+        constraints = problem.with_slack(problem.constraints(z), z.slack)
+        return ravel_pytree(Multipliers(problem.defects(z), constraints))[0]
 
     def convex(p):
-        barrier = LEVELS.barrier * LogBarrier().value(problem.bounds, unravel(p)).sum()
+        barrier = WEIGHTS.barrier * LogBarrier().value(problem.bounds, unravel(p)).sum()
         return problem.cost(unravel(p)) + barrier
 
     J = jax.jacobian(h)(point)
-    M = jax.hessian(convex)(point) + LEVELS.penalty * J.T @ J + LEVELS.damping * jnp.eye(len(point))
+    M = (
+        jax.hessian(convex)(point)
+        + WEIGHTS.penalty * J.T @ J
+        + WEIGHTS.damping * jnp.eye(len(point))
+    )
     return M, jax.grad(lagrangian)(point), h(point), J, jax.hessian(lagrangian)(point)
+
+
+@jax.jit
+def direction(problem, trajectory, multipliers, key):
+    by, key_model = Autodiff(), jax.random.split(key)[0]
+    at = trajectory, multipliers, WEIGHTS
+    model = expand(problem, LogBarrier(), *at, by, key_model)
+    return GaussNewton().direction(problem, model, True, key, ())
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.4], ids=["linear", "nonlinear"])
@@ -153,14 +163,12 @@ def test_gauss_newtons_direction_is_that_of_the_dense_metric(bend):
     problem, (trajectory, multipliers) = constrained(bend), somewhere()
     M, gradient, h, J, hessian = dense(problem, trajectory, multipliers)
     if bend == 0.0:  # M is then all of the Hessian of L_mu, and delta
-        np.testing.assert_allclose(hessian + LEVELS.damping * np.eye(len(M)), M, atol=1e-11)
-    to = jax.jit(GaussNewton.direction)(
-        GaussNewton(), problem, LogBarrier(), trajectory, multipliers, LEVELS, jax.random.key(0)
-    )
+        np.testing.assert_allclose(hessian + WEIGHTS.damping * np.eye(len(M)), M, atol=1e-11)
+    to = direction(problem, trajectory, multipliers, jax.random.key(0))
     step = -np.linalg.solve(M, gradient)
     np.testing.assert_allclose(ravel_pytree(to.drift)[0], step, atol=1e-10)
     rates = ravel_pytree(to.multipliers)[0]
-    np.testing.assert_allclose(rates, LEVELS.penalty * (h + J @ step), atol=1e-9)
+    np.testing.assert_allclose(rates, WEIGHTS.penalty * (h + J @ step), atol=1e-9)
 
 
 def test_gauss_newtons_noise_has_covariance_1_over_m():
@@ -171,8 +179,7 @@ def test_gauss_newtons_noise_has_covariance_1_over_m():
     @jax.jit
     @jax.vmap
     def noise(key):
-        to = GaussNewton().direction(problem, LogBarrier(), trajectory, multipliers, LEVELS, key)
-        return ravel_pytree(to.noise)[0]
+        return ravel_pytree(direction(problem, trajectory, multipliers, key).noise)[0]
 
     white = noise(jax.random.split(jax.random.key(0), draws)) @ np.linalg.cholesky(M)
     np.testing.assert_allclose(white.mean(0), 0, atol=6 / draws**0.5)
@@ -258,7 +265,8 @@ def test_a_speed_limit_is_kept_and_felt():
 def run(solver, problem):
     knots = Trajectory(jnp.zeros((1, N, 2)), jnp.zeros((1, N, 1)))
     stop = solver.iterations + solver.tail
-    return advance(solver, problem, solver.init(problem, knots, jax.random.key(0)), 0, stop)
+    begun = iterate.start(solver, problem, knots, jax.random.key(0))
+    return iterate.advance(solver, problem, begun, 0, stop)[0]
 
 
 SHORT = Langevin(iterations=15, tail=5)
@@ -282,11 +290,11 @@ def test_no_constraints_are_the_same_as_constraints_without_rows():
 
 
 def test_numbers_of_constraints_change_without_recompiling():
-    before, ends = advance._cache_size(), []
+    before, ends = iterate.iterate._cache_size(), []
     for limit, target in ((0.7, TARGET), (0.4, TARGET), (0.7, 2 * TARGET)):
         problem = cart(inequality=Partial(limits, limit), terminal_equality=Partial(miss, target))
         ends.append(run(SHORT, problem).trajectory.u)
-    assert advance._cache_size() - before == 1
+    assert iterate.iterate._cache_size() - before == 1
     assert not np.array_equal(ends[0], ends[1])
     assert not np.array_equal(ends[0], ends[2])
 

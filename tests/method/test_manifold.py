@@ -13,12 +13,13 @@ import pytest
 
 from mjx_drax import LBFGS, Diagonal, DraxError, GaussNewton, Identity, Langevin, from_mjcf, solve
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.method.langevin import advance
-from mjx_drax.method.metrics import Levels, augmented_lagrangian, displaced
+from mjx_drax.method.model import augmented_lagrangian, expand
+from mjx_drax.method.schedules import Weights
 from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.joints import Joints
 from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.problem.problem import Trajectory
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search import iterate
 
 K = 5
 
@@ -70,7 +71,7 @@ XML = """
   </actuator>
 </mujoco>"""
 TURNED = [0.8, 0.0, 0.6, 0.0]
-LEVELS = Levels(*map(jnp.asarray, (0.0, 10.0, 0.1, 0.01)))
+WEIGHTS = Weights(*map(jnp.asarray, (0.0, 10.0, 0.1, 0.01)))
 METRICS = [Identity(), Diagonal(), GaussNewton(), LBFGS()]
 
 
@@ -95,18 +96,17 @@ def task():
 def chain(task):
     """Knots, multipliers that are not zero, and the merit of knots displaced by tangent numbers."""
     solver = Langevin()
-    start = jax.tree.map(lambda a: a[None], task.draw(jax.random.key(0)))
-    state = solver.init(task, start, jax.random.key(1))
-    knots, multipliers = jax.tree.map(lambda a: a[0], (state.trajectory, state.multipliers))
+    state = solver.init(task, task.draw(jax.random.key(0)), jax.random.key(1))
+    knots, multipliers = state.trajectory, state.multipliers
     rng = np.random.default_rng(0)
     rates = jnp.asarray(rng.normal(size=multipliers.dynamics.shape), jnp.float32)
     multipliers = replace(multipliers, dynamics=rates, bounds=None)
 
     @jax.jit
     def merit(change):
-        moved = displaced(task, knots, change)
-        terms = augmented_lagrangian(task, solver.bounds, moved, multipliers, LEVELS)
-        return jnp.sum(terms)
+        moved = task.displaced(knots, change)
+        at = moved, multipliers, WEIGHTS, task.values(moved)
+        return jnp.sum(augmented_lagrangian(task, solver.bounds, *at))
 
     return knots, multipliers, merit
 
@@ -116,9 +116,9 @@ def direction(metric, task, chain):
 
     @jax.jit
     def found(task, knots, multipliers):
-        memory = metric.memory(task, knots)
-        key = jax.random.key(0)
-        return metric.direction(task, Langevin().bounds, knots, multipliers, LEVELS, key, memory)
+        at, key = (knots, multipliers, WEIGHTS), jax.random.key(0)
+        model = expand(task, Langevin().bounds, *at, metric.derivatives, jax.random.split(key)[0])
+        return metric.direction(task, model, True, key, metric.memory(task, knots))
 
     return found(task, knots, multipliers)
 
@@ -158,8 +158,8 @@ def test_the_identitys_drift_is_the_steepest_descent(task, chain):
 def test_the_tail_needs_few_steps_and_keeps_quaternions_unit(task):
     solver = Langevin(iterations=0, tail=15)
     start = jax.vmap(task.draw)(jax.random.split(jax.random.key(0), 4))
-    state = solver.init(task, start, jax.random.key(0))
-    state = advance(solver, task, state, 0, 15)
+    state = iterate.start(solver, task, start, jax.random.key(0))
+    state, _ = iterate.advance(solver, task, state, 0, 15)
     lengths = np.linalg.norm(state.trajectory.x[..., :4], axis=-1)
     np.testing.assert_allclose(lengths, 1, atol=1e-5)
     assert float(jax.vmap(task.max_defect)(state.trajectory).max()) < 1e-3
@@ -173,5 +173,5 @@ def test_metropolis_adjustment_is_refused(task):
 def test_given_knots_are_scaled_to_unit_quaternions(task):
     x = np.ones((K, 7))
     guess = Trajectory(x, np.zeros((K, 3)))
-    seen = replace(task, aside=replace(task.aside, guess=lambda key: guess)).draw(None)
+    seen = replace(task, guess=lambda key: guess).draw(None)
     np.testing.assert_allclose(seen.x[:, :4], 0.5)

@@ -12,8 +12,8 @@ import pytest
 
 from mjx_drax import Constant, DraxError, GaussNewton, Geometric, Identity, Langevin, LogBarrier
 from mjx_drax.method.bounds import Projection, Reflection
-from mjx_drax.method.langevin import advance
-from mjx_drax.problem.problem import Trajectory, box
+from mjx_drax.problem.trajectory import Trajectory, box
+from mjx_drax.search.iterate import advance, start
 from mjx_drax.solution.program import from_program, minimize
 
 Q = np.array([[2.0, 1.2], [1.2, 1.0]])
@@ -26,8 +26,9 @@ NOISY = Langevin(noise=Constant(SIGMA), damping=Constant(0.0), iterations=10**6)
 
 
 def sampled(solver, steps):
-    start = Trajectory(jnp.zeros((CHAINS, 1, 0)), jnp.tile(jnp.asarray(CENTRE), (CHAINS, 1, 1)))
-    state = advance(solver, QUADRATIC, solver.init(QUADRATIC, start, jax.random.key(0)), 0, steps)
+    knots = Trajectory(jnp.zeros((CHAINS, 1, 0)), jnp.tile(jnp.asarray(CENTRE), (CHAINS, 1, 1)))
+    begun = start(solver, QUADRATIC, knots, jax.random.key(0))
+    state, _ = advance(solver, QUADRATIC, begun, 0, steps)
     return np.asarray(state.trajectory.u[:, 0], float)
 
 
@@ -66,10 +67,9 @@ def test_gauss_newton_samples_the_gaussian_of_its_step_size(alpha, damping):
 
 
 def test_adjusted_steps_need_a_constant_metric():
-    start = Trajectory(jnp.zeros((1, 1, 0)), jnp.zeros((1, 1, 2)))
     solver = Langevin(adjusted=True, preconditioner=GaussNewton())
     with pytest.raises(DraxError, match=r"adjusted=True with GaussNewton.*Identity"):
-        solver.init(QUADRATIC, start, jax.random.key(0))
+        minimize(QUADRATIC, chains=1, solver=solver)
 
 
 def test_annealing_finds_the_deeper_of_two_wells():
@@ -133,17 +133,17 @@ def test_every_noisy_step_stays_inside_and_the_optimum_is_found(bounds, precondi
         iterations=1000,
         tail=100,
     )
-    start = Trajectory(jnp.zeros((64, 1, 0)), jnp.full((64, 1, 2), 0.5))
-    state = solver.init(BOUNDED, start, jax.random.key(0))
+    knots = Trajectory(jnp.zeros((64, 1, 0)), jnp.full((64, 1, 2), 0.5))
+    state = start(solver, BOUNDED, knots, jax.random.key(0))
     walls = []
     for i in range(8):
-        state = advance(solver, BOUNDED, state, i, i + 1)
+        state, _ = advance(solver, BOUNDED, state, i, i + 1)
         x = np.asarray(state.trajectory.u)
         assert x.min() >= 0
         assert x.max() <= 1
         walls.append(np.minimum(x, 1 - x).min())
     assert min(walls) < 0.05  # they were tried
-    x = np.asarray(advance(solver, BOUNDED, state, 8, 1100).trajectory.u[:, 0])
+    x = np.asarray(advance(solver, BOUNDED, state, 8, 1100)[0].trajectory.u[:, 0])
     assert (np.abs(x - CORNER).max(1) < 0.1).mean() > 0.9, x
 
 

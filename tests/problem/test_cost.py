@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_drax.problem.cost import Cost, as_partial, cost_of
 from mjx_drax.problem.differentiators import Autodiff
-from mjx_drax.problem.dynamics import as_partial
-from mjx_drax.problem.problem import Cost, cost_of
 
 N = 4
 Z = np.linspace(-1.0, 1.5, N)

@@ -11,9 +11,10 @@ from scipy.stats import norm
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, from_function, solve
 from mjx_drax.method.bounds import LogBarrier
-from mjx_drax.method.metrics import Levels, Multipliers
+from mjx_drax.method.model import Multipliers, expand
+from mjx_drax.method.schedules import Weights
 from mjx_drax.problem.differentiators import Autodiff, Smoothed
-from mjx_drax.problem.problem import Stagewise, Trajectory
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
 N, M = 8, 5
 W = np.random.default_rng(0).normal(size=(M, N)) / N**0.5
@@ -132,9 +133,17 @@ def test_the_papers_flow_is_the_same_from_assembled_derivatives(by, atol):
         slack = Stagewise(jnp.abs(normal(K, 3)), jnp.abs(normal(1)))
         z = Trajectory(normal(K, 2), normal(K, 1), slack)
         multipliers = Multipliers(normal(K, 2), Stagewise(normal(K, 4), normal(2)))
-        levels = Levels(*map(jnp.asarray, (0.5, 5.0, 0.2, 0.3)))
-        arguments = constrained(), LogBarrier(), z, multipliers, levels, jax.random.key(0)
-        one, other = (jax.jit(Identity.direction)(Identity(b), *arguments) for b in (None, by))
+        weights = Weights(*map(jnp.asarray, (0.5, 5.0, 0.2, 0.3)))
+
+        @jax.jit
+        def direction(metric, problem, z, multipliers, weights):
+            keys = jax.random.split(jax.random.key(0))
+            at = z, multipliers, weights, metric.derivatives
+            model = expand(problem, LogBarrier(), *at, keys[0])
+            return metric.direction(problem, model, True, keys[1], ())
+
+        at = constrained(), z, multipliers, weights
+        one, other = (direction(Identity(derivatives), *at) for derivatives in (None, by))
         for part in ("drift", "noise", "multipliers"):
             flat, expected = (ravel_pytree(getattr(d, part))[0] for d in (other, one))
             scale = np.abs(expected).max()
