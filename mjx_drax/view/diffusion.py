@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,7 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.view.drawing import Canvas, knot_at
 from mjx_drax.view.frames import Frame, captioned, even_size, text_box, video_path, write
 from mjx_drax.view.geoms import Floats
-from mjx_drax.view.renderer import Renderer, open_renderer
+from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import FREE, Scene, body_positions, camera_for, travelling_body
 from mjx_drax.view.video import check, frame_times, outcome_lines
 
@@ -82,7 +80,7 @@ def render_diffusion(
       chains: number of chains whose paths are shown, those of distinct optima first.
       fps: frames per second.
       size: (height, width) [pixels].
-      camera: a camera of the model, see `render_frames`; None sees all that is shown.
+      camera: a camera of the model, see `motion_frames`; None sees all that is shown.
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes, one line of
         it with a vertex for each state; needed for problems without a model.
@@ -106,22 +104,33 @@ def render_diffusion(
     shown = [recording.path(chain) for chain in _chains(solution, chains)]
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
-    moments = _moments(shown[0], seconds, fps)
     height, width = even_size(size)
     below = 2 * round(_STRIP * height / 2)
-    film = Film(solution, shown, Colors.of(shown[0]), height - below, width)
-    model, lines = mujoco_model(problem.dynamics), outcome_lines(solution)
+    states = finite(solution.replayed[0])
+    times = problem.times[: len(states)]
+    film = Film(
+        shown=shown,
+        colors=Colors.of(shown[0]),
+        moments=_moments(shown[0], seconds, fps),
+        states=states,
+        times=times,
+        frame_times=frame_times(times, fps, speed),
+        size=(height - below, width),
+    )
+    lines, model = outcome_lines(solution), mujoco_model(problem.dynamics)
+    captions = [(_caption(solution, shown[0], at), 0.0, at) for at in film.moments]
+    captions += [(lines, time, film.moments[-1]) for time in film.frame_times]
 
     def frames() -> Generator[Frame, None, None]:
+        if model is not None:
+            pictures = _robot_pictures(film, model, ghosts, FREE if camera is None else camera)
+        else:
+            assert draw is not None  # as checked
+            left = text_box(lines, *film.size)[1][2] / width
+            pictures = _task_pictures(film, draw, np.asarray(problem.x_init, float), left)
         strip = CurveStrip(shown[0], film.colors, below, width)
-        with _picture(film, model, ghosts, camera, draw) as picture:
-            for at in moments:
-                frame = captioned(picture.knots(at), _caption(solution, shown[0], at), 0.0)
-                yield np.concatenate([frame, strip.frame(at)])
-            end = strip.frame(moments[-1])
-            for time in frame_times(film.times, fps, speed):
-                frame = captioned(picture.motion(time), lines, time)
-                yield np.concatenate([frame, end])
+        for picture, (text, time, at) in zip(pictures, captions, strict=True):
+            yield np.concatenate([captioned(picture, text, time), strip.frame(at)])
 
     return write(path, frames(), fps)
 
@@ -222,161 +231,119 @@ def _blend(defects: Floats, before: int, after: int, share: float) -> Floats:
     return np.exp((1.0 - share) * logs[0] + share * logs[1])
 
 
-# The picture above
+# Pictures above
 
 
 @dataclass(frozen=True)
 class Film:
-    """What is filmed: the chains shown, the best one first, and the size of the picture above."""
+    """What is filmed.
 
-    solution: Solution
+    Attributes:
+        shown: the chains, the best one first.
+        colors: of their defects.
+        moments: for each frame before the motion is played, where it is among the best chain's
+            snapshots.
+        states, times: the replay (T, nx) at (T,) [s], up to where it turns non-finite.
+        frame_times: of the frames that play it [s].
+        size: (height, width) of the picture above the curves [pixels].
+    """
+
     shown: Sequence[ChainHistory]
     colors: Colors
-    height: int
-    width: int
-
-    @property
-    def best(self) -> ChainHistory:
-        """What the best chain went through."""
-        return self.shown[0]
-
-    @cached_property
-    def states(self) -> Floats:
-        """The replay (T, nx), up to where it turns non-finite."""
-        return finite(self.solution.replayed[0])
-
-    @property
-    def times(self) -> Floats:
-        """Of the replay's knots, (T,) [s]."""
-        return self.solution.problem.times[: len(self.states)]
+    moments: Floats
+    states: Floats
+    times: Floats
+    frame_times: Floats
+    size: tuple[int, int]
 
     def lines(self, points: Sequence[Floats], at: float) -> Iterator[tuple[Floats, Floats]]:
         """Each chain's line through its knots at a moment, (K, d), and its colors (K - 1, 4).
 
-        Of every chain, points (snapshots, K, d) say where its knots are in the picture.
+        For each chain, points (snapshots, K, d) say where its knots are in the picture.
         """
-        for chain, its_points in zip(self.shown, points, strict=True):
-            i, j, share = _same_moment(self.best, chain, at)
+        best = self.shown[0]
+        for chain, its_points in zip(self.shown[: len(points)], points, strict=True):
+            i, j, share = _same_moment(best, chain, at)
             colors = self.colors(_blend(chain.defects, i, j, share)[1:])
-            colors[:, 3] = 1.0 if chain is self.best else _OTHER
+            colors[:, 3] = 1.0 if chain is best else _OTHER
             yield (1.0 - share) * its_points[i] + share * its_points[j], colors
 
 
-@contextmanager
-def _picture(
-    film: Film,
-    model: mujoco.MjModel | None,
-    ghosts: int | None,
-    camera: str | int | None,
-    draw: Draw | None,
-) -> Iterator[RobotPicture | TaskPicture]:
-    """What draws the upper part of the film."""
-    if model is None:
-        assert draw is not None  # as checked
-        yield TaskPicture(film, draw)
-        return
-    with open_renderer(model, film.height, film.width) as renderer:
-        yield RobotPicture(film, model, renderer, ghosts, FREE if camera is None else camera)
-
-
-class RobotPicture:
+def _robot_pictures(
+    film: Film, model: mujoco.MjModel, ghosts: int | None, camera: str | int
+) -> Iterator[Frame]:
     """The robot at some knots, and the paths of a body that travels."""
+    best, nq, qpos = film.shown[0], model.nq, film.states[:, : model.nq]
+    parts = int(np.count_nonzero(model.body_weldid[model.geom_bodyid] != 0))
+    count = int(np.clip(_PARTS // max(parts, 1), *_COUNT)) if ghosts is None else ghosts
+    horizon, body = best.x.shape[1], travelling_body(model)
+    knots = np.linspace(0, horizon - 1, min(count, horizon)).round().astype(int)
+    points: list[Floats] = []
+    if body is not None:
+        points = [body_positions(model, body, chain.x[..., :nq]) for chain in film.shown]
+    seen = np.concatenate([qpos, best.x[0, knots, :nq].astype(float)])
+    scene = Scene(model, camera_for(model, seen, camera, film.size[1] / film.size[0]))
 
-    def __init__(
-        self,
-        film: Film,
-        model: mujoco.MjModel,
-        renderer: Renderer,
-        ghosts: int | None,
-        camera: str | int,
-    ) -> None:
-        self._film, self._model, self._renderer = film, model, renderer
-        self._qpos = film.states[:, : model.nq]
-        x, body = film.best.x, travelling_body(model)
-        parts = int(np.count_nonzero(model.body_weldid[model.geom_bodyid] != 0))
-        count = int(np.clip(_PARTS // max(parts, 1), *_COUNT)) if ghosts is None else ghosts
-        self._knots = np.linspace(0, x.shape[1] - 1, min(count, x.shape[1])).round().astype(int)
-        self._points: list[Floats] | None = None
-        if body is not None:
-            motions = (chain.x[:, :, : model.nq] for chain in film.shown)
-            self._points = [body_positions(model, body, qpos) for qpos in motions]
-        seen = np.concatenate([self._qpos, x[0, self._knots, : model.nq].astype(float)])
-        aspect = film.width / film.height
-        self._scene = Scene(model, camera_for(model, seen, camera, aspect))
-
-    def knots(self, at: float) -> Frame:
-        """The knots at a moment among the snapshots."""
-        self._scene.begin(None)
-        return self._rendered(at, self._knots, _GHOST)
-
-    def motion(self, time: float) -> Frame:
-        """The replay at a time [s], among the knots that it came from."""
-        self._scene.begin(interpolated(self._model, self._qpos, self._film.times, time))
-        return self._rendered(len(self._film.best.x) - 1.0, self._knots[::_FEWER], _FAINT)
-
-    def _rendered(self, at: float, knots: npt.NDArray[np.int64], opacity: float) -> Frame:
-        best, nq = self._film.best, self._model.nq
-        if self._points is not None:
-            for rank, (line, colors) in enumerate(self._film.lines(self._points, at)):
-                self._scene.add_line(line, colors, 3.0 if rank == 0 else 1.2)
+    def add(at: float, some: npt.NDArray[np.int64], opacity: float) -> None:
+        for rank, (line, colors) in enumerate(film.lines(points, at)):
+            scene.add_line(line, colors, 3.0 if rank == 0 else 1.2)
         before, after, share = _neighbours(at, len(best.x))
-        colors = self._film.colors(_blend(best.defects, before, after, share))
-        for k in knots:
+        colors = film.colors(_blend(best.defects, before, after, share))
+        for k in some:
             one, other = best.x[[before, after], k, :nq].astype(float)
-            pose = moved(self._model, one, between(self._model, one, other), share)
-            self._scene.add_robot(pose, opacity, colors[k, :3])
-        return self._renderer.render(self._scene.content)
+            pose = moved(model, one, between(model, one, other), share)
+            scene.add_robot(pose, opacity, colors[k, :3])
+
+    with open_renderer(model, *film.size) as renderer:
+        for at in film.moments:
+            scene.begin(None)
+            add(at, knots, _GHOST)
+            yield renderer.render(scene.content)
+        for time in film.frame_times:
+            scene.begin(interpolated(model, qpos, film.times, time))
+            add(film.moments[-1], knots[::_FEWER], _FAINT)
+            yield renderer.render(scene.content)
 
 
-class TaskPicture:
-    """The chains' paths on what a task's draw function shows."""
+def _task_pictures(film: Film, draw: Draw, x_init: Floats, left: float) -> Iterator[Frame]:
+    """The chains' paths on what a task draws; a share of the width is left to the caption."""
+    from matplotlib.collections import LineCollection
 
-    def __init__(self, film: Film, draw: Draw) -> None:
-        from matplotlib.collections import LineCollection
+    points = [_traced(draw, chain.x.astype(float)) for chain in film.shown]
+    canvas = Canvas.within(*film.size, left=left)
+    axes = canvas.figure.add_subplot()
+    artists = [
+        LineCollection([], linewidths=2.6 if i == 0 else 1.0, zorder=5 if i == 0 else 4)
+        for i in range(len(film.shown))
+    ]
 
-        self._film, self._draw = film, draw
-        self._points = [_traced(draw, chain.x.astype(float)) for chain in film.shown]
-        box = text_box(outcome_lines(film.solution), film.height, film.width)[1]
-        self._canvas = Canvas.within(film.height, film.width, left=box[2] / film.width)
-        self._axes = self._canvas.figure.add_subplot()
-        self._lines = [
-            LineCollection([], linewidths=2.6 if i == 0 else 1.0, zorder=5 if i == 0 else 4)
-            for i in range(len(film.shown))
-        ]
-        self._knot = -1
-        self._background = self._drawn(np.asarray(film.solution.problem.x_init, float)[None])
+    def drawn(states: Floats) -> Any:
+        axes.clear()
+        draw(axes, states)
+        for artist in artists:
+            axes.add_collection(artist)
+            artist.set_animated(True)
+        canvas.agg.draw()
+        return canvas.agg.copy_from_bbox(canvas.figure.bbox)
 
-    def knots(self, at: float) -> Frame:
-        """The knots at a moment among the snapshots."""
-        return self._rendered(at, 1.0)
-
-    def motion(self, time: float) -> Frame:
-        """The replay at a time [s], among the knots that it came from."""
-        knot = knot_at(self._film.times, time)
-        if knot != self._knot:
-            self._background = self._drawn(self._film.states[: knot + 1])
-            self._knot = knot
-        return self._rendered(len(self._film.best.x) - 1.0, 0.35)
-
-    def _drawn(self, states: Floats) -> Any:
-        """What the task draws of states (k + 1, nx), without the paths."""
-        self._axes.clear()
-        self._draw(self._axes, states)
-        for line in self._lines:
-            self._axes.add_collection(line)
-            line.set_animated(True)
-        self._canvas.agg.draw()
-        return self._canvas.agg.copy_from_bbox(self._canvas.figure.bbox)
-
-    def _rendered(self, at: float, opacity: float) -> Frame:
-        self._canvas.agg.restore_region(self._background)
-        lines = zip(self._lines, self._film.lines(self._points, at), strict=True)
-        for line, (points, colors) in reversed(list(lines)):  # the best chain on top
+    def with_paths(background: Any, at: float, opacity: float) -> Frame:
+        canvas.agg.restore_region(background)
+        lines = zip(artists, film.lines(points, at), strict=True)
+        for artist, (line, colors) in reversed(list(lines)):  # the best chain on top
             colors[:, 3] *= opacity
-            line.set_segments(list(np.stack([points[:-1], points[1:]], axis=1)))
-            line.set_color(list(map(tuple, colors)))
-            self._axes.draw_artist(line)
-        return self._canvas.pixels()
+            artist.set_segments(list(np.stack([line[:-1], line[1:]], axis=1)))
+            artist.set_color(list(map(tuple, colors)))
+            axes.draw_artist(artist)
+        return canvas.pixels()
+
+    background, shown = drawn(x_init[None]), -1
+    for at in film.moments:
+        yield with_paths(background, at, 1.0)
+    for time in film.frame_times:
+        knot = knot_at(film.times, time)
+        if knot != shown:
+            background, shown = drawn(film.states[: knot + 1]), knot
+        yield with_paths(background, film.moments[-1], 0.35)
 
 
 def _traced(draw: Draw, states: Floats) -> Floats:
@@ -396,7 +363,7 @@ def _traced(draw: Draw, states: Floats) -> Floats:
     return found[0].reshape(*states.shape[:-1], 2)
 
 
-# The curves below
+# Curves below
 
 
 class CurveStrip:

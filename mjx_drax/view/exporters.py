@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mjx_drax.base.files import require
 from mjx_drax.solution.export import Exporter
 
 if TYPE_CHECKING:
@@ -74,9 +75,7 @@ class Dataset(Exporter):
 
     def check(self, problem: Problem) -> None:
         """Complain if h5py is not installed."""
-        from mjx_drax.solution.formats import require_h5py
-
-        require_h5py()
+        require("h5py", "dataset", "a dataset")
 
     def write(self, solution: Solution, path: Path) -> None:
         """Write the chains; see `formats.save_dataset`."""

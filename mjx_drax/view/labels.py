@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mjx_drax.physics.dynamics import mujoco_model
@@ -11,53 +10,28 @@ from mjx_drax.physics.engine import mujoco
 if TYPE_CHECKING:
     from mjx_drax.problem.dynamics import Dynamics
 
-_JOINT = mujoco.mjtJoint
-_UNITS = {_JOINT.mjJNT_SLIDE: "m", _JOINT.mjJNT_HINGE: "rad"}
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_UNITS = {mujoco.mjtJoint.mjJNT_SLIDE: "m", mujoco.mjtJoint.mjJNT_HINGE: "rad"}
 
 
-@dataclass(frozen=True)
-class Coordinate:
-    """A coordinate of positions in tangent space: its name, and its unit if that is known."""
+def coordinates(dynamics: Dynamics) -> list[tuple[str, str]]:
+    """Name and unit of the coordinates of positions in tangent space, (nv,).
 
-    name: str
-    unit: str
-
-    @property
-    def position(self) -> str:
-        """Label of its axis."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
-    @property
-    def velocity_unit(self) -> str:
-        """Unit of its velocity, in brackets."""
-        return f" [{self.unit}/s]" if self.unit else ""
-
-
-def coordinates(dynamics: Dynamics) -> list[Coordinate]:
-    """Coordinates of positions in tangent space; of a function's states, those of the first half.
-
-    A joint with several coordinates has its places x, y, z [m] first, then its turns [rad].
+    A free joint moves along x, y, z [m]; it and a ball joint turn about x, y, z [rad]. Without a
+    model they are the first half of the states, whose units are unknown, "".
     """
     model = mujoco_model(dynamics)
     if model is None:
-        return [Coordinate(f"x[{i}]", "") for i in range(dynamics.nx // 2)]
-    out: list[Coordinate] = []
-    for joint, kind in joints(model):
-        if kind == _JOINT.mjJNT_FREE:
-            out += [Coordinate(f"{joint} {axis}", "m") for axis in "xyz"]
-        if kind in (_JOINT.mjJNT_FREE, _JOINT.mjJNT_BALL):
-            out += [Coordinate(f"{joint} turn {axis}", "rad") for axis in "xyz"]
+        return [(f"x[{i}]", "") for i in range(dynamics.nx // 2)]
+    found: list[tuple[str, str]] = []
+    for joint, kind in _joints(model):
+        if kind == _FREE:
+            found += [(f"{joint} {axis}", "m") for axis in "xyz"]
+        if kind in _UNITS:
+            found.append((joint, _UNITS[kind]))
         else:
-            out.append(Coordinate(joint, _UNITS[kind]))
-    return out
-
-
-def joints(model: mujoco.MjModel) -> list[tuple[str, mujoco.mjtJoint]]:
-    """Name and kind of each joint."""
-    return [
-        (model.joint(j).name or f"joint {j}", _JOINT(int(model.jnt_type[j])))
-        for j in range(model.njnt)
-    ]
+            found += [(f"{joint} turn {axis}", "rad") for axis in "xyz"]
+    return found
 
 
 def tangent_labels(dynamics: Dynamics) -> list[str]:
@@ -65,9 +39,9 @@ def tangent_labels(dynamics: Dynamics) -> list[str]:
     model = mujoco_model(dynamics)
     if model is None:
         return [f"x[{i}]" for i in range(dynamics.ndx)]
-    positions = [coordinate.name for coordinate in coordinates(dynamics)]
-    velocities = [f"{name}, velocity" for name in positions]
-    return [*positions, *velocities, *(f"act[{i}]" for i in range(model.na))]
+    names = [name for name, _ in coordinates(dynamics)]
+    velocities = [f"{name}, velocity" for name in names]
+    return [*names, *velocities, *(f"act[{i}]" for i in range(model.na))]
 
 
 def state_groups(dynamics: Dynamics) -> dict[str, dict[int, str]]:
@@ -77,19 +51,19 @@ def state_groups(dynamics: Dynamics) -> dict[str, dict[int, str]]:
         return {"states": {i: f"x[{i}]" for i in range(dynamics.nx)}}
     positions: dict[int, str] = {}
     orientations: dict[int, str] = {}
-    for (joint, kind), column in zip(joints(model), model.jnt_qposadr.tolist(), strict=True):
+    for (joint, kind), column in zip(_joints(model), model.jnt_qposadr.tolist(), strict=True):
         if kind in _UNITS:
             positions[column] = f"{joint} [{_UNITS[kind]}]"
             continue
-        if kind == _JOINT.mjJNT_FREE:
+        if kind == _FREE:
             positions |= {column + i: f"{joint} {axis} [m]" for i, axis in enumerate("xyz")}
             column += 3
         orientations |= {column + i: f"{joint} q{part}" for i, part in enumerate("wxyz")}
-    moving = coordinates(dynamics)
+    velocities = [f"{name} [{unit}/s]" for name, unit in coordinates(dynamics)]
     groups = {
         "positions": positions,
         "orientations": orientations,
-        "velocities": {model.nq + i: c.name + c.velocity_unit for i, c in enumerate(moving)},
+        "velocities": dict(enumerate(velocities, model.nq)),
         "activations": {model.nq + model.nv + i: f"act[{i}]" for i in range(model.na)},
     }
     return {kind: labels for kind, labels in groups.items() if labels}
@@ -101,3 +75,8 @@ def control_labels(dynamics: Dynamics) -> list[str]:
     if model is None:
         return [f"u[{i}]" for i in range(dynamics.nu)]
     return [model.actuator(i).name or f"actuator {i}" for i in range(dynamics.nu)]
+
+
+def _joints(model: mujoco.MjModel) -> list[tuple[str, mujoco.mjtJoint]]:
+    kinds = map(mujoco.mjtJoint, model.jnt_type.tolist())
+    return [(model.joint(j).name or f"joint {j}", kind) for j, kind in enumerate(kinds)]

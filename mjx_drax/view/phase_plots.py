@@ -19,7 +19,7 @@ from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import between, finite
 from mjx_drax.view.geoms import Floats
-from mjx_drax.view.labels import Coordinate, coordinates, tangent_labels
+from mjx_drax.view.labels import coordinates, tangent_labels
 from mjx_drax.view.plotting import (
     BLUE,
     DPI,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mjx_drax.problem.dynamics import Dynamics
     from mjx_drax.solution.solution import Solution
 
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _DIVERGING = "RdBu_r"  # safe for colour-blind readers
 
 
@@ -62,29 +63,31 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
     phases = [_phases(dynamics, states) for states in (plan, finite(solution.replayed[0]))]
     known = coordinates(dynamics)
     panels = [
-        partial(_draw_phase, coordinate=coordinate, motions=[(q[:, i], v[:, i]) for q, v in phases])
-        for i, coordinate in enumerate(known[:PANELS])
+        partial(_draw_phase, label=label, motions=[(q[:, i], v[:, i]) for q, v in phases])
+        for i, label in enumerate(known[:PANELS])
     ]
     figure = panel_figure(panels, 3, (3.2, 2.7), legend=4)
     left = len(known) - len(panels)
     more = f" (and {left} more coordinates)" if left else ""
-    title = f"{solution.problem.name}: phase plots{more}; the replay is {solution.replay_mode}"
+    title = f"{solution.problem.name}: phase plots{more}, replayed {solution.replay_mode}"
     figure.suptitle(title, fontsize=9, parse_math=False)
     return save_figure(figure, path)
 
 
 def _draw_phase(
-    axes: Axes, coordinate: Coordinate, motions: list[tuple[np.ndarray, np.ndarray]]
+    axes: Axes, label: tuple[str, str], motions: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    """Velocity against position, for the plan and the replay."""
+    """Velocity against position of a coordinate with a name and unit: the plan, and the replay."""
     plan, (position, velocity) = motions
     axes.plot(position, velocity, color=BLUE, lw=2.2, label="replay")
     axes.plot(*plan, "--", color=VERMILLION, lw=1.1, label="plan")
     for at, marker, word in ((0, "o", "start"), (-1, "s", "end")):
         style: Any = {"color": BLUE, "mec": "white", "ms": 7, "ls": "none", "zorder": 4}
         axes.plot(position[at], velocity[at], marker, label=word, **style)
-    label_panel(axes, coordinate.position, coordinate.position, [])
-    axes.set_ylabel(f"velocity{coordinate.velocity_unit}", fontsize=8)
+    name, unit = label
+    place = f"{name} [{unit}]" if unit else name
+    label_panel(axes, place, place, [])
+    axes.set_ylabel(f"velocity [{unit}/s]" if unit else "velocity", fontsize=8)
 
 
 def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
@@ -145,10 +148,9 @@ def _phases(dynamics: Dynamics, states: Floats) -> tuple[Floats, Floats]:
     nq, nv = model.nq, model.nv
     qpos = states[:, :nq]
     positions = np.array([between(model, qpos[0], q) for q in qpos])
-    for j in range(model.njnt):  # where it can be, from the model's zero, not from the first pose
-        q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
-            positions[:, v : v + 3] = qpos[:, q : q + 3]
-        elif model.jnt_type[j] != mujoco.mjtJoint.mjJNT_BALL:
-            positions[:, v] = qpos[:, q]
+    # Where there is a zero position, positions count from it, not from the first pose
+    sizes = {_FREE: 3, _BALL: 0}
+    for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
+        size = sizes.get(int(kind), 1)
+        positions[:, v : v + size] = qpos[:, q : q + size]
     return positions, states[:, nq : nq + nv]

@@ -39,15 +39,7 @@ _NEUTRAL_SKY = np.array([[0.30, 0.36, 0.44], [0.74, 0.78, 0.82]])
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole camera.
-
-    Attributes:
-        position: of the hole, (3,).
-        axes: right, up and back in world coordinates, the rows of (3, 3).
-        focal: distance of the picture from the hole [pixels].
-        center: pixel that the camera looks at.
-        near: depth before which nothing is drawn.
-    """
+    """A pinhole camera: position (3,), rows right, up, back (3, 3), pixels per unit slope."""
 
     position: Floats
     axes: Floats

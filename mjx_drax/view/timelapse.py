@@ -39,7 +39,7 @@ def render_timelapse(
       path: where to, ending in .png; its folder is made if need be.
       count: number of poses, the last one included.
       size: (height, width) [pixels].
-      camera: a camera of the model, see `render_frames`; None frames the motion.
+      camera: a camera of the model, see `motion_frames`; None frames the motion.
 
     Raises:
       DraxError: a path, size, count or camera that cannot be used, or no model.

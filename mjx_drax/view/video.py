@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +52,7 @@ def render(
       path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       fps: frames per second.
       size: (height, width) [pixels].
-      camera: a camera of the model, see `render_frames`.
+      camera: a camera of the model, see `motion_frames`.
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
         for problems without a model (others do not use it).
@@ -66,11 +66,11 @@ def render(
     times, overlay = solution.problem.times[: len(states)], outcome_lines(solution)
     model = mujoco_model(solution.problem.dynamics)
     if model is not None:
-        frames = _frames(model, states[:, : model.nq], times, overlay, fps, size, camera, speed)
-    else:
-        assert draw is not None  # as checked
-        frames = _drawn_frames(draw, states, times, overlay, fps, size, speed)
-    return write(path, frames, fps)
+        qpos, look = states[:, : model.nq], {"size": size, "camera": camera, "speed": speed}
+        return render_motion(model, qpos, times, path, overlay=overlay, fps=fps, **look)
+    assert draw is not None  # as checked
+    moments = frame_times(times, fps, speed)
+    return write(path, _drawn_frames(draw, states, times, moments, overlay, even_size(size)), fps)
 
 
 def check(
@@ -105,21 +105,25 @@ def render_motion(
     times: npt.ArrayLike,
     path: str | os.PathLike[str],
     *,
-    overlay: Sequence[str] = (),
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
-    camera: str | int | None = None,
-    speed: float = 1.0,
+    **look: Any,
 ) -> Path:
     """Films a motion as an H.264 mp4 that browsers play, or as .gif or .webp; returns the path.
 
-    The arguments are those of `render_frames`; the path's folder is made if need be. The file
+    The arguments are those of `motion_frames`; the path's folder is made if need be. The file
     appears once it is complete. Raises DraxError before anything is drawn.
     """
-    return write(path, _frames(model, qpos, times, overlay, fps, size, camera, speed), fps)
+    return write(path, motion_frames(model, qpos, times, fps=fps, **look), fps)
 
 
 def render_frames(
+    model: mujoco.MjModel, qpos: npt.ArrayLike, times: npt.ArrayLike, **look: Any
+) -> Frame:
+    """All frames of `motion_frames`, whose arguments these are: (N, height, width, 3) uint8."""
+    return np.stack(list(motion_frames(model, qpos, times, **look)))
+
+
+def motion_frames(
     model: mujoco.MjModel,
     qpos: npt.ArrayLike,
     times: npt.ArrayLike,
@@ -129,8 +133,8 @@ def render_frames(
     size: tuple[int, int] = (480, 640),
     camera: str | int | None = None,
     speed: float = 1.0,
-) -> Frame:
-    """Frames (N, height, width, 3) uint8 of a motion, the last one held for half a second.
+) -> Generator[Frame, None, None]:
+    """Frames (height, width, 3) uint8 of a motion, the last one held for half a second.
 
     Args:
       model: what moves.
@@ -144,9 +148,23 @@ def render_frames(
       speed: of the motion; 0.5 is slow motion.
 
     Raises:
-      DraxError: positions of the wrong shape or not finite, decreasing times, unknown camera.
+      DraxError: at once, for positions of the wrong shape or not finite, decreasing times, or an
+        unknown camera.
     """
-    return np.stack(list(_frames(model, qpos, times, overlay, fps, size, camera, speed)))
+    positions, knot_times = _checked_motion(model, qpos, times)
+    moments = frame_times(knot_times, fps, speed)
+    if isinstance(overlay, str):
+        raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
+    height, width = even_size(size)
+    scene = Scene(model, camera_for(model, positions, camera, width / height))
+
+    def frames() -> Generator[Frame, None, None]:
+        with open_renderer(model, height, width) as renderer:
+            for time in moments:
+                scene.begin(interpolated(model, positions, knot_times, time))
+                yield captioned(renderer.render(scene.content), overlay, time)
+
+    return frames()
 
 
 def outcome_lines(solution: Solution) -> list[str]:
@@ -181,48 +199,18 @@ def frame_times(times: Floats, fps: float, speed: float = 1.0) -> Floats:
     return np.append(moving, np.full(round(_HOLD * fps), times[-1]))
 
 
-def _frames(
-    model: mujoco.MjModel,
-    qpos: npt.ArrayLike,
-    times: npt.ArrayLike,
-    overlay: Sequence[str],
-    fps: float,
-    size: tuple[int, int],
-    camera: str | int | None,
-    speed: float,
-) -> Generator[Frame, None, None]:
-    """Checks everything now, draws one frame at a time later."""
-    positions, knot_times = _checked_motion(model, qpos, times)
-    moments = frame_times(knot_times, fps, speed)
-    if isinstance(overlay, str):
-        raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
-    height, width = even_size(size)
-    seen_by = camera_for(model, positions, camera, width / height)
-
-    def draw() -> Generator[Frame, None, None]:
-        scene = Scene(model, seen_by)
-        with open_renderer(model, height, width) as renderer:
-            for time in moments:
-                scene.begin(interpolated(model, positions, knot_times, time))
-                yield captioned(renderer.render(scene.content), overlay, time)
-
-    return draw()
-
-
 def _drawn_frames(
     draw: Draw,
     states: np.ndarray,
     times: np.ndarray,
+    moments: Floats,
     overlay: Sequence[str],
-    fps: float,
     size: tuple[int, int],
-    speed: float,
 ) -> Generator[Frame, None, None]:
-    """Frames of states (T, nx), drawn again at each knot, below the overlay."""
-    height, width = even_size(size)
-    top = text_box(overlay, height, width)[1][3] / height
-    canvas, drawn = Canvas.within(height, width, top=top), -1
-    for time in frame_times(times, fps, speed):
+    """Frames at some moments [s] of states (T, nx), drawn again at each knot, below the overlay."""
+    top = text_box(overlay, *size)[1][3] / size[0]
+    canvas, drawn = Canvas.within(*size, top=top), -1
+    for time in moments:
         knot = knot_at(times, time)
         if knot != drawn:
             canvas.figure.clear()

@@ -163,8 +163,7 @@ def test_quaternions_have_a_panel_of_their_own(quadrotor: Dynamics) -> None:
 
 
 def test_phase_plots_of_turns_are_in_tangent_space(quadrotor: Dynamics) -> None:
-    names = [c.position for c in labels.coordinates(quadrotor)]
-    assert names[2:4] == ["root z [m]", "root turn x [rad]"]
+    assert labels.coordinates(quadrotor)[2:4] == [("root z", "m"), ("root turn x", "rad")]
     assert len(labels.tangent_labels(quadrotor)) == 12
     angle = np.linspace(0.0, 3.0, 5)
     states = np.zeros((5, 13))
