@@ -28,6 +28,7 @@ from mjx_drax import (
     from_program,
     solve,
 )
+from mjx_drax.search.restarts import settled
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")
 
@@ -328,11 +329,11 @@ ACCEPTED = {
 
 @pytest.mark.parametrize(("cost", "solver"), ACCEPTED.values(), ids=ACCEPTED)
 def test_what_only_looks_bad_is_accepted(cost, solver):
-    solver.check(point(running_cost=cost))
+    settled(point(running_cost=cost), 1, 0, solver)
 
 
 def test_a_reverse_rule_is_enough_for_a_flow_that_needs_no_other():
-    Langevin(preconditioner=LBFGS()).check(from_program(2, cost=backwards))
+    settled(from_program(2, cost=backwards), 1, 0, Langevin(preconditioner=LBFGS()))
 
 
 @pytest.mark.parametrize("bounds", [None, (-INF, INF), (-INF, 1.0), np.array([[-1, -1], [1, 1]])])

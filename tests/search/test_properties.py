@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from strategies import anything, bounded
 
 from mjx_drax import Constant, DraxError, Geometric, Langevin, Restarts, Trajectory
-from mjx_drax.search.restarts import as_restarts, initial_knots
+from mjx_drax.search.initial import initial_knots
+from mjx_drax.search.restarts import settled
 from mjx_drax.search.settings import changed, names
 
 
@@ -14,8 +15,8 @@ from mjx_drax.search.settings import changed, names
 @given(chains=anything, seed=anything, x=anything, u=anything)
 def test_any_arguments_of_a_solve_are_checked(chains, seed, x, u):
     problem = point()
-    outcome(lambda: as_restarts(problem, chains, 0, Restarts()))
-    outcome(lambda: as_restarts(problem, 1, seed, Restarts()))
+    outcome(lambda: settled(problem, chains, 0, None))
+    outcome(lambda: settled(problem, 1, seed, None))
     guess = outcome(lambda: initial_knots(problem, 2, Trajectory(x, u), None))
     if not isinstance(guess, DraxError):
         assert guess.x.shape == guess.u.shape == (2, 10, 2)
@@ -27,7 +28,7 @@ def test_any_arguments_of_a_solve_are_checked(chains, seed, x, u):
     value=anything | st.builds(Constant, anything) | st.builds(Geometric, anything, anything),
 )
 def test_any_setting_is_checked(name, value):
-    outcome(lambda: as_restarts(point(), 1, 0, Langevin(**{name: value})))
+    outcome(lambda: settled(point(), 1, 0, Langevin(**{name: value})))
 
 
 @bounded

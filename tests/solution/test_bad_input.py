@@ -16,7 +16,7 @@ import pytest
 from builders import INF, NAN, At, arm, assert_complains, cases, cut_short, made_up, parts, robot
 
 from mjx_drax import Solution, from_program, minimize, save_csv, save_dataset, solve, solve_batch
-from mjx_drax.solution.export import export_keyframes
+from mjx_drax.solution.formats import export_keyframes
 from mjx_drax.solution.optima import distinct
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")
@@ -194,7 +194,7 @@ FILES = [
          Solution.load(at.folder),
      ),
      "damaged"),
-    ("json-versions", lambda at: Solution.load(at.saved(format=2, versions=[])), "format 2"),
+    ("json-versions", lambda at: Solution.load(at.saved(format=98, versions=[])), "format 98"),
     ("json-future", lambda at: Solution.load(at.saved(format=99)), "format 99", "solve again"),
     ("json-edited",
      lambda at: (
