@@ -14,9 +14,10 @@ from scipy.linalg import block_diag
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, Trajectory, from_function
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.method.langevin import advance, advance_and_evaluate, evaluate
 from mjx_drax.problem.dynamics import FunctionDynamics
-from mjx_drax.problem.problem import box
+from mjx_drax.problem.trajectory import box
+from mjx_drax.search import iterate
+from mjx_drax.search.iterate import evaluate
 
 K, NX, NU = 4, 2, 1
 A = np.array([[1.0, 0.3], [-0.4, 0.9]])
@@ -67,10 +68,19 @@ def program(x_init=X0, weight=WU, **rest):
     )
 
 
+def advance(*arguments):
+    return iterate.advance(*arguments)[0]
+
+
+def compilations():
+    return iterate.iterate._cache_size()
+
+
 def start(solver, problem, chains=1, seed=0, knots=None):
     rng = np.random.default_rng(seed)
     x, u = knots or (rng.normal(size=(chains, K, NX)), rng.normal(size=(chains, K, NU)))
-    return solver.init(problem, Trajectory(jnp.asarray(x), jnp.asarray(u)), jax.random.key(seed))
+    knots = Trajectory(jnp.asarray(x), jnp.asarray(u))
+    return iterate.start(solver, problem, knots, jax.random.key(seed))
 
 
 def z(state):
@@ -111,44 +121,49 @@ def test_gauss_newtons_partial_steps_reach_it_too():
 @dataclass(frozen=True)
 class Kinked(FunctionDynamics):
     kinked = True
+    state_damping = 0.01
 
 
 def test_states_are_damped_less_where_f_has_kinks():
-    """A full step is -(H + mu J'J + delta D)^-1 grad; another `light` does not recompile."""
+    """A full step is -(H + mu J'J + delta D)^-1 grad; another `state_damping` does not recompile."""
     quiet, problem, delta, mu = Langevin(noise=Constant(0.0)), program(), 0.3, 5.0
     f = problem.dynamics
     kinked = replace(problem, dynamics=Kinked(f.function, f.dt, f.nx, f.nu))
     compiled = []
-    for task, light, of_states in ((kinked, 0.01, 0.01), (kinked, 0.5, 0.5), (problem, 0.01, 1.0)):
+    for task, given, of_states in (
+        (kinked, None, 0.01),
+        (kinked, 0.5, 0.5),
+        (kinked, 0.2, 0.2),
+        (problem, None, 1.0),
+    ):
         solver = replace(
             quiet,
             step_size=1.0,
             penalty=Constant(mu),
             damping=Constant(delta),
-            preconditioner=GaussNewton(light=light),
+            preconditioner=GaussNewton(state_damping=given),
         )
         state = start(solver, task)
         point, D = z(state)[0], np.diag([of_states] * N + [1.0] * K * NU)
         slope = H @ point + g + mu * J.T @ (J @ point + h0)
         expected = point - np.linalg.solve(H + mu * J.T @ J + delta * D, slope)
         np.testing.assert_allclose(z(advance(solver, task, state, 0, 1))[0], expected, rtol=1e-9)
-        compiled.append(advance._cache_size())
-    assert compiled[0] == compiled[1]
+        compiled.append(compilations())
+    assert compiled[1] == compiled[2]
 
 
 @pytest.mark.parametrize("noisy", [0, 2])
-def test_one_loop_advances_and_evaluates_as_two_calls_do(noisy):
+def test_the_loop_that_diagnoses_does_what_the_loop_and_a_diagnosis_do(noisy):
     problem = program()
     f = problem.dynamics
     kinked = replace(problem, dynamics=Kinked(f.function, f.dt, f.nx, f.nu))
-    solver = Langevin(iterations=noisy, tail=4)
+    solver = Langevin(iterations=noisy, tail=4, preconditioner=GaussNewton(state_damping=0.01))
     state = start(solver, kinked)
     for first, last in ((0, 0), (0, 3), (0, 4 + noisy)):
-        moved, info = advance_and_evaluate(solver, kinked, state, first, last)
-        expected = advance(solver, kinked, state, first, last)
+        moved, info = iterate.advance(solver, kinked, state, first, last)
+        expected, wanted = iterate.advance(solver, problem, state, first, last)
         np.testing.assert_allclose(z(moved), z(expected), rtol=1e-12)
         np.testing.assert_allclose(moved.damping, expected.damping)
-        wanted = evaluate(kinked, expected.trajectory)
         np.testing.assert_allclose(info.cost, wanted.cost, rtol=1e-12)
         np.testing.assert_allclose(info.max_defect, wanted.max_defect, rtol=1e-6, atol=1e-12)
     assert info.max_defect.max() > 0.0
@@ -313,14 +328,14 @@ def test_numbers_change_without_recompiling():
         (replace(base, barrier_weight=Geometric(1.0, 0.1, 1e-3)), make()),
         (replace(base, bounds=replace(base.bounds, floor=1e-4, fraction=0.5)), make()),
     ]
-    before, answers = advance._cache_size(), []
+    before, answers = compilations(), []
     for solver, problem in cases:
         state = start(solver, problem, chains=2)
         for begin in range(0, 8, 4):
             state = advance(solver, problem, state, begin, begin + 4)
         answers.append(z(state))
         traced.append("case")
-    assert advance._cache_size() - before == 1
+    assert compilations() - before == 1
     assert set(traced[traced.index("case") :]) == {"case"}  # traced for the first case only
     for answer in answers[1:]:
         assert not np.array_equal(answer, answers[0])  # every one of these numbers matters
@@ -329,7 +344,9 @@ def test_numbers_change_without_recompiling():
 def test_products_are_not_rounded_on_gpus():
     """By default JAX rounds their factors to 10 bits (TF32) there, and defects stall at 1e-3."""
     solver = replace(QUIET, iterations=1, tail=1)
-    text = advance.lower(solver, program(), start(solver, program()), 0, 2).as_text()
+    shared, own = iterate.partition(iterate.Question(solver, program()), None)
+    rows = start(solver, program()), own
+    text = iterate.iterate.lower(rows, shared, 0, 2).as_text()
     products = [line for line in text.splitlines() if "stablehlo.dot_general" in line]
     assert products
     assert all("precision = [HIGHEST, HIGHEST]" in line for line in products)
