@@ -200,19 +200,20 @@ class Search:
         self.clock = time.perf_counter() - before
         try:
             while not ended:
-                if not self.stage.begun:
-                    self._begin_chunk()
-                if not self._iterate() or not self._roll_out():
-                    break
-                ended = not self._next_chunk() and not self._next_attempt()
+                if self.stage.place < len(self.stage.todo):
+                    if not self.stage.begun:
+                        self._begin_chunk()
+                    if not self._iterate() or not self._roll_out():
+                        break
+                    self._next_chunk()
+                if self.stage.place == len(self.stage.todo):
+                    ended = not self._next_attempt()
         except KeyboardInterrupt:  # between two chunks
-            pass
+            answered |= self.stage.begun and not self.family.alone  # one may be half kept
         if not answered:
             self._save(ended, now=True)
         found = self._merged() if self.stage.begun else self.stage.kept
         assert found is not None
-        if jax.process_count() > 1:  # of a state that is split, the others hold a part
-            found = self._whole(found)
         stage, solve_time = self.stage, time.perf_counter() - self.clock
         records, began = list(stage.records), list(stage.began)
         return Found(found, records, began, first, compile_time, solve_time)
@@ -242,7 +243,7 @@ class Search:
         zeros = jnp.zeros(rows)
         info = Info(zeros, zeros, zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
-            state, info = jax.block_until_ready(self._iterated(state, 0, 0))
+            _, info = jax.block_until_ready(self._iterated(state, 0, 0))
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
         now = Chains(state, info, np.full(rows, -1))
         kept = None if family.alone else _unset(now, family.count * self.chains)
@@ -261,7 +262,7 @@ class Search:
         knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, indices, stage.cost_scale)
         state = begin(self.question[1], self.question[0], knots, keys)
-        state, info = jax.block_until_ready(self._iterated(state, 0, 0))
+        _, info = jax.block_until_ready(self._iterated(state, 0, 0))
         now = Chains(state, info, np.full(len(owners), -1))
         ones = np.ones(len(owners))
         self.stage = replace(
@@ -279,8 +280,8 @@ class Search:
         self.stage = replace(stage, cost_scale=scale)
         self._settle(0, indices, scale)
 
-    def _next_chunk(self) -> bool:
-        """Keep the best of the chunk; whether the attempt has another."""
+    def _next_chunk(self) -> None:
+        """Keep the best of the chunk, and go on to the next one."""
         stage = self.stage
         place = min(stage.place + self.size, len(stage.todo))
         self.stage = replace(stage, kept=self._merged(), place=place, begun=False)
@@ -289,7 +290,6 @@ class Search:
             if self.chunk_done is not None:
                 N, todo = self.family.count, len(stage.todo)
                 self.chunk_done(N - todo + place, N)
-        return place < len(stage.todo)
 
     def _next_attempt(self) -> bool:
         """Go on to another attempt; False if none is to be made."""
@@ -316,10 +316,9 @@ class Search:
 
     def _merged(self) -> Chains:
         """The best of all attempts, this one included."""
-        stage, kept = self.stage, self.stage.kept
+        stage, kept, now = self.stage, self.stage.kept, self._whole(self.stage.now)
         if kept is None:
-            return stage.now
-        now = self._whole(stage.now)
+            return now
         if self.family.alone:
             return best_of(kept, now, stage.owners)
         fresh = min(self.size, len(stage.todo) - stage.place)
@@ -347,8 +346,7 @@ class Search:
             return knots, chain_keys(key_noise, self.chains)
         keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(indices))
         guess = self.family.problem.guess
-        _, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
-        shared, _ = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
+        shared, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
         return _drawn_by_row(own.problem, shared.problem, keys, self.chains, guess)
 
     def _settle(self, attempt: int, indices: np.ndarray, cost_scale: np.ndarray) -> None:
@@ -394,16 +392,14 @@ class Search:
             self.stage = replace(stage, began=(*stage.began, (stage.done, stage.done + noisy)))
             self._record()
         total = flow.iterations + flow.tail
-        before = self.stage.done - self.stage.step
-        every = max(REPORT_EVERY, total // 100)
-        every = min(every, self.recorder.every) if self.recorder is not None else every
+        before = self.stage.done - self.stage.step if self.family.alone else 0
         try:
             while self.stage.step < total:
                 stage, now = self.stage, self.stage.now
-                stop = min(stage.step + every, total)
+                stop = min(stage.step + self._report_every(total), total)
                 state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
                 died_at = np.asarray(gathered(state.died_at, self.mesh))
-                if stage.attempt == 0 and stage.step == 0 and (died_at == 0).all():
+                if stage.attempt == stage.place == stage.step == 0 and (died_at == 0).all():
                     knots = gathered(now.state.trajectory, self.mesh)
                     require_sound(flow, self.family.at(0), knots)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
@@ -413,6 +409,11 @@ class Search:
         except KeyboardInterrupt:  # the chains as they were at the last report
             return False
         return True
+
+    def _report_every(self, total: int) -> int:
+        """Iterations up to the next report, for an attempt of so many."""
+        usual = max(REPORT_EVERY, total // 100)
+        return usual if self.recorder is None else min(usual, self.recorder.every)
 
     # Rollouts
 
@@ -461,8 +462,7 @@ class Search:
         gains, dtype = with_feedback * np.asarray(chains.state.gains), knots.x.dtype
         start = np.broadcast_to(rows.x_init, (len(knots.x), problem.dynamics.nx))
         plan = np.concatenate([start[:, None], knots.x], axis=1)
-        indices = np.repeat(self.indices, self.chains)
-        states, controls = self.family.replay(indices, plan, np.asarray(knots.u), gains)
+        states, controls = self.family.replay(self.indices, plan, np.asarray(knots.u), gains)
         rolled = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
@@ -522,7 +522,8 @@ class Search:
 
         whole, kept = jax.eval_shape(state), family.count * self.chains / rows
         rounds = settings.rollouts.rounds if settings.rollouts else 0
-        reports, recording = settings.attempts * (100 + rounds), 0
+        reports = settings.attempts * (100 + rounds) if family.alone else 1
+        recording = 0
         if recorder is not None:
             reports += settings.iterations // recorder.every
             snapshots = reports * rows * (nx + 2) * problem.horizon * dtype.itemsize
@@ -612,7 +613,7 @@ def _slim(chains: Chains) -> Chains:
 def _unset(like: Chains, rows: int) -> Chains:
     """Places on the host for the best of so many chains, infinitely bad so far."""
     empty: Chains = jax.tree.map(lambda a: np.zeros((rows, *a.shape[1:]), a.dtype), _slim(like))
-    worst: Any = Info(*[np.full(rows, np.inf)] * 3)  # type: ignore[arg-type]
+    worst: Info = jax.tree.map(lambda a: np.full(rows, np.inf), like.info)  # an array each
     return replace(empty, info=worst, feasible_since=np.full(rows, -1))
 
 

@@ -198,13 +198,11 @@ class Family:
     def replay(
         self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`Problem.replay` of one plan of each of those problems, (len(indices), ...)."""
+        """`Problem.replay` of those problems' plans, as many of each, problem by problem."""
         if not self.varies("dynamics", "bounds"):
             return self.problem.replay(plan, u, gains)
-        ran = [
-            self.at(int(i)).replay(*(a[k : k + 1] for a in (plan, u, gains)))
-            for k, i in enumerate(indices)
-        ]
+        parts = (np.split(a, len(indices)) for a in (plan, u, gains))
+        ran = [self.at(int(i)).replay(*own) for i, *own in zip(indices, *parts, strict=True)]
         return np.concatenate([run[0] for run in ran]), np.concatenate([run[1] for run in ran])
 
 

@@ -110,14 +110,6 @@ class Restarts:
             return self.flow
         return replace(self.flow, iterations=self.descent, scale=scale_of(cost_scale, 0.0))
 
-    def later(self, cost_scale: float, temperature: float) -> Langevin:
-        """The settings of a further attempt, for a scale of costs and the best cost so far."""
-        if not self.heated:
-            return self.first(cost_scale)
-        if self.descent is None:
-            return self.flow
-        return replace(self.flow, scale=scale_of(cost_scale, np.sqrt(temperature)))
-
     def for_problem(self, problem: Problem) -> Restarts:
         """The same settings, with a value for each that is None."""
         kinked = problem.dynamics.kinked
