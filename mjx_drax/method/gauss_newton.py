@@ -28,7 +28,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels.linalg import transposed_product
-from mjx_drax.method.metrics import Direction, Metric, drawn
+from mjx_drax.method.metrics import Direction, Metric
 from mjx_drax.method.model import Derivatives, Model, Multipliers, QuadraticCost
 from mjx_drax.method.riccati import White, newton
 from mjx_drax.problem.differentiators import Autodiff, Differentiator
@@ -58,32 +58,29 @@ class GaussNewton(Metric):
     state_damping: ArrayLike | None = None
 
     def direction(
-        self, problem: Problem, model: Model, noisy: Array | bool, key: Array, memory: Any
+        self, problem: Problem, model: Model, key: Array | None, memory: Any
     ) -> Direction:
-        """Drift, noise and multiplier rate, from one factorization; with feedback gains."""
-        derivatives, weights, multipliers = model.derivatives, model.weights, model.multipliers
+        """Drift, multiplier rate and noise, from one factorization; with feedback gains."""
+        derivatives, mu, multipliers = model.derivatives, model.weights.penalty, model.multipliers
         assert derivatives is not None  # for the type checker
         given = self.state_damping
         of_states = problem.dynamics.state_damping if given is None else given
-        cost = _with_barrier(derivatives.cost, *model.barrier, weights.damping, of_states)
+        cost = _with_barrier(derivatives.cost, *model.barrier, model.weights.damping, of_states)
         cost, stages, end = _with_constraints(cost, derivatives, model)
-        white, slack_white = None, None
-        if noisy is not False:
-            draw = _white(problem, stages, end, key)
-            white, slack_white = drawn(noisy, draw, jax.eval_shape(draw))
-        step = newton(derivatives.dynamics, cost, multipliers.dynamics, weights.penalty, white)
+        white, xi = (None, None) if key is None else _white(problem, stages, end, key)
+        step = newton(derivatives.dynamics, cost, multipliers.dynamics, mu, white)
         slack = model.gradient.slack
-        dz, mu = (_stage_steps(step.dx, step.du), step.dx[-1]), weights.penalty
-        ds, rate = jax.vmap(partial(slack_step, penalty=mu))(stages, dz[0])
-        ds_end, rate_end = slack_step(end, dz[1], mu)
+        ds, rate = jax.vmap(partial(slack_step, penalty=mu))(stages, _stage_steps(step.dx, step.du))
+        ds_end, rate_end = slack_step(end, step.dx[-1], mu)
         drift = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if slack else None)
-        noise = problem.no_change(model.trajectory)
-        if slack_white is not None:
-            nz = _stage_steps(step.nx, step.nu), step.nx[-1]
-            ns = jax.vmap(partial(slack_noise, penalty=mu))(stages, nz[0], slack_white[0])
-            ns_end = slack_noise(end, nz[1], slack_white[1], mu)
-            noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
+        if xi is None:
+            return Direction(drift, None, rates, step.K, memory)
+        ns = jax.vmap(partial(slack_noise, penalty=mu))(
+            stages, _stage_steps(step.nx, step.nu), xi.stage
+        )
+        ns_end = slack_noise(end, step.nx[-1], xi.terminal, mu)
+        noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None)
         return Direction(drift, noise, rates, step.K, memory)
 
 
@@ -172,22 +169,20 @@ def _with_constraints(
     return with_constraints, stages, end
 
 
-def _white(problem: Problem, stages: Eliminated, end: Eliminated, key: Array) -> Any:
-    """A function that draws standard normal numbers for controls, defects and slacks."""
+def _white(
+    problem: Problem, stages: Eliminated, end: Eliminated, key: Array
+) -> tuple[White, Stagewise]:
+    """Standard normal numbers for controls and defects, and for slacks."""
     K, dynamics = problem.horizon, problem.dynamics
-
-    def draw() -> tuple[White, tuple[Array, Array]]:
-        _, key_noise, key_slack = jax.random.split(key, 3)
-        key_u, key_e = jax.random.split(key_noise)
-        return White(
-            jax.random.normal(key_u, (K, dynamics.nu)),
-            jax.random.normal(key_e, (K, dynamics.ndx)),
-        ), (
-            jax.random.normal(key_slack, stages.D.shape),
-            jax.random.normal(jax.random.fold_in(key_slack, 1), end.D.shape),
-        )
-
-    return draw
+    _, key_noise, key_slack = jax.random.split(key, 3)
+    key_u, key_e = jax.random.split(key_noise)
+    return White(
+        jax.random.normal(key_u, (K, dynamics.nu)),
+        jax.random.normal(key_e, (K, dynamics.ndx)),
+    ), Stagewise(
+        jax.random.normal(key_slack, stages.D.shape),
+        jax.random.normal(jax.random.fold_in(key_slack, 1), end.D.shape),
+    )
 
 
 def _stage_steps(dx: Array, du: Array) -> Array:

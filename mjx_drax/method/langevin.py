@@ -31,7 +31,7 @@ from mjx_drax.method.bounds import Bounds, LogBarrier
 from mjx_drax.method.descent import Info
 from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.metrics import Direction, Metric
-from mjx_drax.method.model import Multipliers, expand
+from mjx_drax.method.model import Model, Multipliers, expand
 from mjx_drax.method.schedules import Geometric, Scale, Schedule, Weights
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
@@ -161,34 +161,37 @@ class Langevin:
         iteration = jnp.asarray(iteration)
         noisy = iteration < self.iterations if noise else False
         noisy = noisy if moves is None else noisy & moves
-        weights = self.weights(self.progress(iteration, noisy))
+        weights, metric = self.weights(self.progress(iteration, noisy)), self.preconditioner
         key = jax.random.fold_in(state.key, iteration)
+        compute = (lambda f: f()) if moves is None else partial(where_needed, moves)
+        model = compute(partial(self._model, problem, state, weights, key, tail))
 
-        def diffuse() -> tuple[Trajectory, Array, Info]:
-            X = self._diffused(problem, state, to, weights, key)
-            zero = jnp.zeros(())
-            return X, jnp.asarray(self.step_size, zero.dtype), Info(zero, zero, zero)
+        def diffuse() -> tuple[Any, ...]:
+            to = metric.direction(problem, model, key, state.memory)
+            X, zero = self._diffused(problem, state, to, weights, key, tail), jnp.zeros(())
+            alpha, info = jnp.asarray(self.step_size, zero.dtype), Info(zero, zero, zero)
+            return X, alpha, info, to.multipliers, to.gains, to.memory
 
-        def descend() -> tuple[Trajectory, Array, Info]:
-            at, ladder = (state.trajectory, state.multipliers), self.preconditioner.ladder
-            return descent.line_search(problem, self.bounds, *at, weights, to.drift, ladder)
+        def descend() -> tuple[Any, ...]:
+            to = compute(lambda: metric.direction(problem, model, None, state.memory))
+            at = problem, self.bounds, state.trajectory, state.multipliers, weights
+            chosen = descent.line_search(*at, to.drift, metric.ladder)
+            return *chosen, to.multipliers, to.gains, to.memory
 
-        directed = partial(self._direction, problem, state, weights, noisy, key, tail)
-        to = directed() if moves is None else where_needed(moves, directed)
-        if tail and noise:
-            X, size, info = jax.lax.cond(noisy, diffuse, descend)
-        else:
-            X, size, info = diffuse() if noise else descend()
-        alpha = jnp.ones_like(size) if self.preconditioner.full_multiplier_steps else size
+        chosen = diffuse if noise else descend
+        found = jax.lax.cond(noisy, diffuse, descend) if tail and noise else chosen()
+        X, size, info, rate, gains, memory = found
+        alpha = jnp.ones_like(size) if metric.full_multiplier_steps else size
         lambda_ = jax.tree.map(
-            lambda m, r: m + alpha * r, replace(state.multipliers, bounds=None), to.multipliers
+            lambda m, r: m + alpha * r, replace(state.multipliers, bounds=None), rate
         )
+        v = state.multipliers.bounds
         new = replace(
             state,
             trajectory=X,
-            multipliers=replace(lambda_, bounds=state.multipliers.bounds),
-            gains=to.gains,
-            memory=to.memory,
+            multipliers=replace(lambda_, bounds=v),
+            gains=gains,
+            memory=memory,
         )
         if tail:
             new = descent.adapted(problem, self.bounds, state, new, size, weights, noisy)
@@ -199,39 +202,36 @@ class Langevin:
         into_tail = (iteration - self.iterations + 1) / jnp.maximum(self.tail, 1)
         return jnp.where(noisy, iteration / jnp.maximum(self.iterations - 1, 1), 1.0 + into_tail)
 
-    def _direction(
+    def _model(
+        self, problem: Problem, state: State, weights: Weights, key: Array, tail: bool
+    ) -> Model:
+        """The model at the chain's knots. Bounds have multipliers of their own in the tail."""
+        present = state.multipliers if tail else replace(state.multipliers, bounds=None)
+        damped = descent.with_damping(weights, state.damping)
+        by, key_model = self.preconditioner.derivatives, jax.random.split(key)[0]
+        return expand(problem, self.bounds, state.trajectory, present, damped, by, key_model)
+
+    def _diffused(
         self,
         problem: Problem,
         state: State,
+        to: Direction,
         weights: Weights,
-        noisy: Array | bool,
         key: Array,
         tail: bool,
-    ) -> Direction:
-        """d, n and r at the chain's knots. Bounds have multipliers of their own in the tail."""
-        present = state.multipliers if tail else replace(state.multipliers, bounds=None)
-        metric, damped = self.preconditioner, descent.with_damping(weights, state.damping)
-        key_model = jax.random.split(key)[0]
-        model = expand(
-            problem, self.bounds, state.trajectory, present, damped, metric.derivatives, key_model
-        )
-        return metric.direction(problem, model, noisy, key, state.memory)
-
-    def _diffused(
-        self, problem: Problem, state: State, to: Direction, weights: Weights, key: Array
     ) -> Trajectory:
         """X + alpha d + sigma sqrt(2 alpha) n, kept inside the bounds."""
-        alpha, X = self.step_size, state.trajectory
+        alpha, X, bounds = self.step_size, state.trajectory, self.bounds
         sigma = weights.noise * jnp.sqrt(2.0 * alpha)
         change = jax.tree.map(lambda d, n: alpha * d + sigma * n, to.drift, to.noise)
         new = problem.displaced(X, change)
         if not self.adjusted:
-            return self.bounds.confine(problem.bounds, X, new)
-        there = replace(state, trajectory=new)
-        back = self._direction(problem, there, weights, jnp.array(False), key, True)
-        drifts, lambda_ = (to.drift, back.drift), state.multipliers
+            return bounds.confine(problem.bounds, X, new)
+        there = self._model(problem, replace(state, trajectory=new), weights, key, tail)
+        back = self.preconditioner.direction(problem, there, None, state.memory)
+        drifts = to.drift, back.drift
         return descent.metropolis(
-            problem, self.bounds, X, new, lambda_, weights, alpha, drifts, key
+            problem, bounds, X, new, state.multipliers, weights, alpha, drifts, key
         )
 
 

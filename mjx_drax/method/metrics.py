@@ -12,7 +12,6 @@ the multipliers, feedback gains) replaces `direction`, as `GaussNewton` does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -34,14 +33,14 @@ class Direction:
 
     Attributes:
         drift: d.
-        noise: n, for sigma = 1; zeros where no noise is asked for.
+        noise: n, for sigma = 1; None if no noise is asked for.
         multipliers: their rate r, without that of the bounds.
         gains: feedback that comes with the metric, (K, nu, ndx); zeros if none does.
         memory: what the metric wants to see again in the next iteration.
     """
 
     drift: Trajectory
-    noise: Trajectory
+    noise: Trajectory | None
     multipliers: Multipliers
     gains: Array
     memory: Any = ()
@@ -82,12 +81,12 @@ class Metric:
         return ()
 
     def direction(
-        self, problem: Problem, model: Model, noisy: Array | bool, key: Array, memory: Any
+        self, problem: Problem, model: Model, key: Array | None, memory: Any
     ) -> Direction:
-        """Drift, noise (drawn where `noisy`) and multiplier rate."""
+        """Drift, multiplier rate, and noise if there is a key to draw it with."""
         M = self.at(model)
         drift = jax.tree.map(jnp.negative, self.solve(M, model.gradient))
-        noise = drawn(noisy, lambda: self.sample(M, drift, jax.random.split(key)[1]), drift)
+        noise = None if key is None else self.sample(M, drift, jax.random.split(key)[1])
         rate = jax.tree.map(lambda h: 2.0 * model.weights.penalty * h, model.h)
         K, nu, ndx = problem.horizon, problem.dynamics.nu, problem.dynamics.ndx
         return Direction(drift, noise, rate, jnp.zeros((K, nu, ndx)), memory)
@@ -99,13 +98,6 @@ def white(like: Trajectory, key: Array) -> Trajectory:
     keys = jax.random.split(key, len(leaves))
     noise = [jax.random.normal(k, z.shape, z.dtype) for k, z in zip(keys, leaves, strict=True)]
     return jax.tree.unflatten(tree, noise)
-
-
-def drawn(noisy: Array | bool, draw: Callable[[], Any], like: Any) -> Any:
-    """draw() where `noisy`, else zeros in the shape of `like`."""
-    if noisy is False:
-        return jax.tree.map(jnp.zeros_like, like)
-    return jax.lax.cond(noisy, draw, lambda: jax.tree.map(jnp.zeros_like, like))
 
 
 @register_dataclass

@@ -181,7 +181,7 @@ def feedback_gains(own: Question, shared: Question, states: State) -> Array:
         key = jax.random.split(state.key)[0]
         present = state.multipliers, weights, metric.derivatives
         model = expand(q.problem, flow.bounds, knots, *present, key)
-        return metric.direction(q.problem, model, False, state.key, ()).gains
+        return metric.direction(q.problem, model, None, ()).gains
 
     found: Array = _by_row(shared, own, gains, states)
     return found

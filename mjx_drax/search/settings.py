@@ -153,7 +153,7 @@ def _changed(part: Any, path: list[str], name: str, text: str) -> Any:
 
 def _value(old: Any, kind: str, name: str, text: str) -> Any:
     """The text as a value of the kind that the field's annotation says."""
-    role = next((method for method in _ROLES if hasattr(type(old), method)), None)
+    role = next((method for method in _ROLES if hasattr(old, method)), None)
     role = "jacobian" if "Differentiator" in kind else role
     value = _literal(text)
     if role == "__call__" and not isinstance(value, str):

@@ -66,10 +66,10 @@ class LBFGS(Metric):
         return Memory(pairs, pairs, none, trajectory, zero, jnp.zeros((), jnp.int32))
 
     def direction(
-        self, problem: Problem, model: Model, noisy: Array | bool, key: Array, memory: Any
+        self, problem: Problem, model: Model, key: Array | None, memory: Any
     ) -> Direction:
         """The quasi-Newton step; multipliers move in every `inner`-th step only."""
-        steepest = super().direction(problem, model, noisy, key, memory)
+        steepest = super().direction(problem, model, key, memory)
         gradient, back = ravel_pytree(model.gradient)
         memory = self._remember(problem, memory, model.trajectory, gradient)
         drift = back(-_inverse_times(memory, gradient))
