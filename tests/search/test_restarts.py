@@ -1,19 +1,30 @@
 """Descending first, heating what failed: nothing found is lost, and no setting depends on units."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import bouncing
 
-from mjx_drax import DraxError, Langevin, Restarts, from_function, from_program, minimize
-from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.method.langevin import Info, State
-from mjx_drax.problem.dynamics import FunctionDynamics
-from mjx_drax.search import restarts
-from mjx_drax.search.restarts import Attempt, run
-from mjx_drax.solution.solution import solve
+from mjx_drax import (
+    DraxError,
+    Langevin,
+    Restarts,
+    Trajectory,
+    from_function,
+    from_program,
+    minimize,
+    solve,
+    solve_batch,
+)
+from mjx_drax.method.descent import Info
+from mjx_drax.method.langevin import State
+from mjx_drax.search.engine import Chains, Search, best_of
+from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import iterate
+from mjx_drax.search.restarts import Rollouts, settled
 
 DT, K = 0.1, 20
 
@@ -25,6 +36,12 @@ def wells(x):
 
 PROGRAM = from_program(2, cost=wells, bounds=(-2.0, 2.0))
 SHORT = replace(Restarts().flow, iterations=40, tail=20)
+
+
+def search(solver, chains=8, problem=PROGRAM, progress=None):
+    """What a search comes to: where the chains are, its records, when attempts began."""
+    settings = settled(problem, chains, 0, solver)
+    return Search(Family.of_one(problem), chains, 0, settings, progress=progress).run()
 
 
 def swing(weight=1.0):
@@ -70,11 +87,11 @@ def test_no_setting_depends_on_the_units_of_the_cost(weight):
 
 
 def test_attempts_share_one_compilation():
-    before = restarts._advance._cache_size()
-    found = run(PROGRAM, 8, 0, Restarts(SHORT, attempts=3, enough=2.0))
+    before = iterate._cache_size()
+    found = search(Restarts(SHORT, attempts=3, enough=2.0))
     assert found.records[-1][0] == 120 + 2 * 60
     assert found.began == [(0, 0), (120, 160), (180, 220)]  # the first has no noise
-    assert restarts._advance._cache_size() - before == 1
+    assert iterate._cache_size() - before == 1
 
 
 def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
@@ -83,53 +100,64 @@ def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
             raise KeyboardInterrupt
 
     solver = Restarts(SHORT, attempts=5)
-    first = run(PROGRAM, 8, 0, replace(solver, attempts=1))
-    kept = run(PROGRAM, 8, 0, solver, progress=interrupt)
+    first = search(replace(solver, attempts=1)).chains
+    kept = search(solver, progress=interrupt)
     assert kept.records[-1][0] == 140
-    cheaper = np.asarray(kept.info.cost) <= np.asarray(first.info.cost)
-    assert (cheaper & kept.feasible >= first.feasible).all()
+    cheaper = kept.chains.cost <= first.cost
+    assert (cheaper & kept.chains.feasible >= first.feasible).all()
 
 
-def test_ctrl_c_between_two_attempts_keeps_the_answers_of_the_first(monkeypatch):
-    start = restarts._Search._start
+def test_ctrl_c_between_two_attempts_keeps_the_answers_of_the_first():
+    reports, drawn = [], []
 
-    def interrupted(self, flow, attempt):
-        if attempt:
+    def guess(key):
+        drawn.append(key)
+        if reports and reports[-1] == 120:  # the first attempt's last; the second draws its knots
             raise KeyboardInterrupt
-        return start(self, flow, attempt)
+        return Trajectory(jnp.zeros((1, 0)), jax.random.uniform(key, (1, 2), minval=-2.0))
 
-    monkeypatch.setattr(restarts._Search, "_start", interrupted)
-    kept = run(PROGRAM, 8, 0, Restarts(SHORT))
-    monkeypatch.undo()
-    first = run(PROGRAM, 8, 0, Restarts(SHORT, attempts=1))
-    np.testing.assert_array_equal(kept.state.trajectory.u, first.state.trajectory.u)
+    problem = replace(PROGRAM, guess=guess)
+    first = search(Restarts(SHORT, attempts=1), problem=problem)
+    before = len(drawn)
+    kept = search(
+        Restarts(SHORT), problem=problem, progress=lambda done, *_: reports.append(done)
+    )
+    assert len(drawn) == before + 2  # once for each attempt
+    assert kept.records[-1][0] == 120
+    np.testing.assert_array_equal(
+        kept.chains.state.trajectory.u, first.chains.state.trajectory.u
+    )
 
 
 def attempt(costs, defects, label):
-    """An attempt whose knots say which one it was, and which place."""
+    """An attempt whose knots say which one it was, and which row."""
     n = len(costs)
     marks = label + jnp.arange(n)[:, None]
     state = State(marks, marks, marks, marks, (), marks, jnp.ones(n, bool), jnp.full(n, -1))
     info = Info(jnp.asarray(costs, float), jnp.asarray(defects, float), jnp.zeros(n))
-    return Attempt(state, info, label + np.arange(n))
+    return Chains(state, info, label + np.arange(n))
 
 
-def test_every_chain_keeps_the_best_that_was_found_for_it():
+@pytest.mark.parametrize("kind", [jnp.asarray, np.asarray])  # on the device and on the host
+def test_every_chain_keeps_the_best_that_was_found_for_it(kind):
     kept = attempt([5.0, 1.0, 3.0, 9.0], [0.0, 1.0, 0.0, 0.5], 100)
     found = attempt([4.0, 7.0, np.nan, 8.0], [0.0, 0.0, np.nan, 0.2], 200)
-    # places 0 and 2 worked for chain 0, place 1 for chain 1, place 3 for chain 3
-    best = restarts._best(kept, found, np.array([0, 1, 0, 3]))
+    kept, found = (jax.tree.map(kind, chains) for chains in (kept, found))
+    # rows 0 and 2 worked for chain 0, row 1 for chain 1, row 3 for chain 3
+    best = best_of(kept, found, np.array([0, 1, 0, 3]))
     expected = [200, 201, 102, 203]  # cheaper; feasible; untouched; less infeasible
     np.testing.assert_array_equal(best.state.trajectory[:, 0], expected)
-    np.testing.assert_array_equal(best.converged_at, expected)
+    np.testing.assert_array_equal(best.feasible_since, expected)
     np.testing.assert_array_equal(best.info.cost, [4.0, 7.0, 3.0, 8.0])
 
 
 def test_a_langevin_is_one_attempt_as_it_stands():
-    found = run(PROGRAM, 4, 0, SHORT)
+    found = search(SHORT, chains=4)
     assert found.records[-1][0] == 60
-    again = run(PROGRAM, 4, 0, Restarts(SHORT, descent=None, attempts=1))
-    np.testing.assert_array_equal(found.state.trajectory.u, again.state.trajectory.u)
+    again = search(Restarts(SHORT, descent=None, attempts=1), chains=4)
+    np.testing.assert_array_equal(
+        found.chains.state.trajectory.u, again.chains.state.trajectory.u
+    )
 
 
 @pytest.mark.parametrize(
@@ -141,6 +169,10 @@ def test_a_langevin_is_one_attempt_as_it_stands():
         ({"enough": -0.5}, "enough is -0.5"),
         ({"flow": "fast"}, "flow is 'fast': give a Langevin"),
         ({"flow": Langevin(tail=-1)}, "tail is -1"),
+        ({"heated": "yes"}, "heated is 'yes': give True, False or None"),
+        ({"rollouts": 3}, r"rollouts is 3: give Rollouts\(\) or None"),
+        ({"rollouts": Rollouts(rounds=-1)}, "rollouts.rounds is -1"),
+        ({"rollouts": Rollouts(iterations=0)}, "rollouts.iterations is 0"),
     ],
 )
 def test_settings_that_are_refused(settings, words):
@@ -153,43 +185,19 @@ def test_a_solver_of_another_kind_is_refused():
         minimize(PROGRAM, chains=2, solver="ipopt")
 
 
-@register_dataclass
-@dataclass(frozen=True)
-class Bouncing(FunctionDynamics):
-    """A ball on a stiff floor: f has a kink where they touch."""
-
-    kinked = True
-
-
 @pytest.fixture(scope="module")
-def bouncing():
-    """A ball of 1 kg that bounces on a floor of 300 N/m, with a thrust of 3 N to help it up."""
-
-    def ball(x, u):
-        v = x[1] + 0.05 * (u[0] - 9.81 + 300.0 * jnp.maximum(0.0, -x[0]))
-        return jnp.array([x[0] + 0.05 * v, v])
-
-    problem = from_function(
-        ball,
-        x_init=[1.0, 0.0],
-        nu=1,
-        dt=0.05,
-        horizon=2.0,
-        running_residual=lambda x, u: 0.1 * u,
-        terminal_residual=lambda x: 10.0 * (x - jnp.array([0.9, 0.0])),
-        u_bounds=(-3.0, 3.0),
-        x_scatter=([-0.5, -8.0], [1.5, 8.0]),
-        goal=lambda x: abs(x[0] - 0.9) < 0.1 and abs(x[1]) < 0.5,
-    )
-    dynamics = problem.dynamics
-    kinked = Bouncing(dynamics.function, dynamics.dt, dynamics.nx, dynamics.nu)
-    return problem, replace(problem, dynamics=kinked)
+def balls():
+    """The same bouncing ball without and with being told of the kink."""
+    return bouncing(kinked=None), bouncing()
 
 
-def test_replays_lead_on_where_f_has_kinks(bouncing):
+NO_ROLLOUTS = Rollouts(first=0, rounds=0)
+
+
+def test_rollouts_follow_where_f_has_kinks(balls):
     """The same dynamics with and without being told of the kink."""
     solver = Restarts(attempts=1)
-    plain, kinked = (solve(p, chains=16, solver=solver, record=10) for p in bouncing)
+    plain, kinked = (solve(p, chains=16, solver=solver, record=10) for p in balls)
     assert not plain.feasible.any()
     assert kinked.feasible.mean() > 0.9
     assert kinked.certified
@@ -200,19 +208,71 @@ def test_replays_lead_on_where_f_has_kinks(bouncing):
         assert path.iteration[-1] == kinked.iterations
 
 
-def test_interrupted_while_replays_lead_on_keeps_what_there_is(bouncing):
+def test_rollouts_follow_in_a_batch_too(balls):
+    starts = np.array([[1.0, 0.0], [0.8, 0.5]], np.float32)
+
+    def solved(rollouts=None, **changes):
+        solver = Restarts(attempts=1, rollouts=rollouts)
+        return solve_batch(from_start, starts, chains=8, solver=solver, **changes)
+
+    def from_start(x):
+        return replace(balls[1], x_init=x)
+
+    without, found = solved(NO_ROLLOUTS), solved()
+    assert not (without.chain_defect < 1e-3).any()
+    assert (found.chain_defect < 1e-3).mean() > 0.9
+    assert found.feasible.all()
+    np.testing.assert_array_equal(found.x[:, 0], starts)
+    assert without.open_loop.max_deviation.min() > 1.0
+    assert found.open_loop.max_deviation.max() < 0.02
+    split = solved(chunk=1)  # each problem has its own rollouts
+    np.testing.assert_array_equal(split.u, found.u)
+    np.testing.assert_array_equal(split.chain_cost, found.chain_cost)
+
+
+def test_interrupted_between_rollouts_keeps_what_there_is(balls):
     def stop(done, total, info):
         if done > 170:  # the attempt took 160
             raise KeyboardInterrupt
 
-    solution = solve(bouncing[1], chains=16, progress=stop)
+    solution = solve(balls[1], chains=16, progress=stop)
     assert 170 < solution.iterations < 220
     assert solution.feasible.any()
 
 
-def test_chains_start_near_and_far_where_f_has_kinks(bouncing):
+TINY = replace(Restarts().flow, iterations=4, tail=4)
+
+
+def test_settings_that_depend_on_the_problem(balls):
+    smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
+    assert (smooth.enough, smooth.heated, smooth.rollouts) == (0.95, True, NO_ROLLOUTS)
+    assert (kinked.enough, kinked.heated, kinked.rollouts) == (0.1, False, Rollouts())
+    solver = Restarts(TINY, descent=4, attempts=2)
+    found = solve(balls[1], chains=2, solver=solver).solver
+    assert found == replace(solver, enough=0.1, heated=False, rollouts=Rollouts())
+
+
+def test_no_setting_of_the_users_is_replaced(balls):
+    given = {"enough": 2.0, "heated": True, "rollouts": Rollouts(first=1, rounds=3, iterations=1)}
+    for ball in balls:
+        solver = Restarts(TINY, descent=5, attempts=2, **given)
+        found = solve(ball, chains=2, solver=solver)
+        assert found.solver == solver
+        # And they are what was done: two attempts, the second with noise, rounds of one iteration
+        np.testing.assert_array_equal(found.history["began"], [0, 12])
+        np.testing.assert_array_equal(found.history["noise_ends"], [0, 16])
+        np.testing.assert_array_equal(
+            found.history["iteration"], [0, 9, 10, 11, 12, 20, 21, 22, 23]
+        )
+    none = replace(solver, enough=0.0, heated=False, rollouts=NO_ROLLOUTS)
+    found = solve(balls[1], chains=2, solver=none)
+    assert found.solver == none
+    np.testing.assert_array_equal(found.history["iteration"], [0, 9])
+
+
+def test_chains_start_near_and_far_where_f_has_kinks(balls):
     keys = jax.random.split(jax.random.key(0), 200)
-    near, far = (jax.vmap(p.draw)(keys).x - p.x_init for p in reversed(bouncing))
+    near, far = (jax.vmap(p.draw)(keys).x - p.x_init for p in reversed(balls))
     width = np.abs(near[..., 1]).max(axis=1)
     assert np.abs(far[..., 1]).max(axis=1).min() > 6.0
     assert 0.03 * 7.0 < width.min() < 0.05 * 8.0
