@@ -127,7 +127,7 @@ def on_gpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
 
-@pytest.mark.parametrize("x64", [False, True])
+@pytest.mark.parametrize("x64", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("function", [moved, indexed, elementwise, reduced, factored, controlled])
 def test_every_class_of_operations(function, x64, strictly):
     with jax.enable_x64(x64):

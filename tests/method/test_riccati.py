@@ -80,7 +80,10 @@ def test_float32_needs_no_digits_for_the_penalty():
     np.testing.assert_allclose(flat(step.dx, step.du), d, rtol=1e-3, atol=1e-3 * np.abs(d).max())
 
 
-@pytest.mark.parametrize("mu", [0.1, 10.0, 1e4])
+@pytest.mark.parametrize(
+    "mu",
+    [0.1, pytest.param(10.0, marks=pytest.mark.slow), pytest.param(1e4, marks=pytest.mark.slow)],
+)
 def test_noise_covariance_is_exactly_the_inverse_of_M(mu):
     model, cost, multipliers = drawn(3)
     H, _, J = dense(model, cost)

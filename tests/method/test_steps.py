@@ -47,6 +47,7 @@ def test_small_steps_sample_the_boltzmann_density():
     assert_gaussian(sampled(solver, 700), BOLTZMANN)
 
 
+@pytest.mark.slow
 def test_large_steps_sample_their_own_gaussian_and_adjusted_ones_the_right_one():
     # e <- (1 - alpha Q) e + sigma sqrt(2 alpha) n has S = sigma^2 Q^-1 (1 - alpha Q / 2)^-1
     alpha = 0.4
@@ -57,7 +58,14 @@ def test_large_steps_sample_their_own_gaussian_and_adjusted_ones_the_right_one()
     assert_gaussian(sampled(replace(solver, adjusted=True), 300), BOLTZMANN)
 
 
-@pytest.mark.parametrize(("alpha", "damping"), [(0.05, 0.0), (0.8, 0.0), (0.5, 1.0)])
+@pytest.mark.parametrize(
+    ("alpha", "damping"),
+    [
+        pytest.param(0.05, 0.0, marks=pytest.mark.slow),
+        pytest.param(0.8, 0.0, marks=pytest.mark.slow),
+        (0.5, 1.0),
+    ],
+)
 def test_gauss_newton_samples_the_gaussian_of_its_step_size(alpha, damping):
     # With M = Q + delta: S = sigma^2 Q^-1 (1 - alpha M^-1 Q / 2)^-1
     solver = replace(NOISY, step_size=alpha, damping=Constant(damping))
@@ -72,6 +80,7 @@ def test_adjusted_steps_need_a_constant_metric():
         minimize(QUADRATIC, chains=1, solver=solver)
 
 
+@pytest.mark.slow
 def test_annealing_finds_the_deeper_of_two_wells():
     program = from_program(1, cost=lambda x: (x[0] ** 2 - 1) ** 2 + 0.5 * x[0], scatter=(-1.5, 1.5))
     annealed = Langevin(

@@ -186,6 +186,7 @@ def ball(i, joint):
     return 3 * i + joint
 
 
+@pytest.mark.slow
 def test_the_nearest_contacts_are_enough_where_no_more_act():
     """Two contacts of each friction dimension, with ties among those that act and that do not.
 

@@ -44,6 +44,7 @@ def test_flows_are_the_printed_one():
     assert PENDULUM_FLOW.penalty == Constant(10.0)
 
 
+@pytest.mark.slow
 def test_phase_portrait_is_written_and_its_numbers_are_measured(tmp_path, capsys):
     arguments = f"reproduce phase-portrait --chains 4 --iterations 60 --out {tmp_path}".split()
     assert main(arguments) == 0
@@ -99,6 +100,7 @@ def test_parallel_table_solves_a_problem_for_each_initial_state():
     assert figure_is_drawn(figure)
 
 
+@pytest.mark.slow
 def test_batched_problems_start_where_they_should():
     problem = tasks.load("pendulum").make()
     starts = jnp.array([[3.1, 0.0], [3.0, 0.2], [-3.1, 0.0], [3.2, -0.1]])
