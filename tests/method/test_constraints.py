@@ -155,7 +155,7 @@ def direction(problem, trajectory, multipliers, key):
     by, key_model = Autodiff(), jax.random.split(key)[0]
     at = trajectory, multipliers, WEIGHTS
     model = expand(problem, LogBarrier(), *at, by, key_model)
-    return GaussNewton().direction(problem, model, True, key, ())
+    return GaussNewton().direction(problem, model, key, ())
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.4], ids=["linear", "nonlinear"])
@@ -272,6 +272,7 @@ def run(solver, problem):
 SHORT = Langevin(iterations=15, tail=5)
 
 
+@pytest.mark.slow
 def test_no_constraints_are_the_same_as_constraints_without_rows():
     def nothing(*_):
         return jnp.zeros(0)

@@ -118,7 +118,7 @@ def direction(metric, task, chain):
     def found(task, knots, multipliers):
         at, key = (knots, multipliers, WEIGHTS), jax.random.key(0)
         model = expand(task, Langevin().bounds, *at, metric.derivatives, jax.random.split(key)[0])
-        return metric.direction(task, model, True, key, metric.memory(task, knots))
+        return metric.direction(task, model, key, metric.memory(task, knots))
 
     return found(task, knots, multipliers)
 
