@@ -33,12 +33,6 @@ def trapped() -> Solution:
     return solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT, record=2)
 
 
-@pytest.fixture(scope="module")
-def cartpole() -> Solution:
-    problem = load("cartpole_swingup").make(horizon=0.2)
-    return solve(problem, chains=2, solver=Langevin(iterations=3, tail=1), record=1)
-
-
 def _snapshot(iteration: int, cost: list[float], max_defect: list[float]) -> Snapshot:
     places = len(cost)
     x = np.full((places, 4, 2), float(iteration)) + np.arange(places)[:, None, None]

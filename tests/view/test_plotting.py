@@ -32,12 +32,6 @@ def pendulum() -> Solution:
     return solve(load("pendulum").make(), chains=8, solver=settings)
 
 
-@pytest.fixture(scope="module")
-def cartpole() -> Solution:
-    problem = load("cartpole_swingup").make(horizon=0.2)
-    return solve(problem, chains=2, solver=Langevin(iterations=3, tail=1))
-
-
 def _size(path: Path) -> tuple[int, int]:
     with Image.open(path) as image:
         image.load()

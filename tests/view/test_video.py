@@ -70,12 +70,6 @@ def pendulum() -> Solution:
     return solve(load("pendulum").make(horizon=1.0), chains=8, solver=settings)
 
 
-@pytest.fixture(scope="module")
-def cartpole() -> Solution:
-    problem = load("cartpole_swingup").make(horizon=0.2)
-    return solve(problem, chains=2, solver=Langevin(iterations=3, tail=1))
-
-
 def _judged(solution: Solution, feasible: bool, open_loop: bool, feedback: bool) -> Solution:
     """The solution, as if this had come of all its chains and their replays."""
     chains = solution.chains
