@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import Bouncing, bouncing
 
 from mjx_drax import (
     DraxError,
@@ -22,10 +23,12 @@ from mjx_drax import (
     solve,
     solve_batch,
 )
+from mjx_drax.base import digests
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.problem.dynamics import FunctionDynamics
-from mjx_drax.search import checkpoint, restarts
+from mjx_drax.search import checkpoint, engine
+from mjx_drax.search.iterate import iterate
+from mjx_drax.search.restarts import Rollouts
 
 DT, CHAINS = 0.1, 4
 SOLVER = Restarts(
@@ -142,10 +145,16 @@ def test_killed_at_any_report_it_goes_on_to_the_same_answer(whole, tmp_path):
 
 @pytest.mark.usefixtures("often")
 def test_a_batch_that_is_killed_goes_on_to_the_same_answer(whole_batch, tmp_path):
-    file = tmp_path / "run.ckpt"
+    file, seen = tmp_path / "run.ckpt", []
+
+    def killed(done, total):
+        seen.append(done)
+        raise Killed
+
     for _ in range(9):  # chunks, in three attempts
         with pytest.raises(Killed):
-            batch(checkpoint=file, progress=killed_after(1))
+            batch(checkpoint=file, progress=killed)
+    assert seen == [2, 4, 5] * 3  # and no chunk was solved twice
     assert_same(batch(checkpoint=file, chunk=None), whole_batch)  # whatever memory is free now
     with pytest.raises(DraxError, match="was written for chunk 2, and this solve has chunk 3"):
         batch(checkpoint=file, chunk=3)
@@ -164,54 +173,68 @@ def test_a_recording_goes_on_too(tmp_path):
         solved(checkpoint=file)
 
 
+stop_at_replay = []
+"""What to raise at the next replay but n, as [n, exception]; empty for nothing."""
+
+
 @register_dataclass
 @dataclass(frozen=True)
-class Bouncing(FunctionDynamics):
-    """A ball on a stiff floor: chains are led on along replays."""
+class Stopped(Bouncing):
+    """The bouncing ball, whose replays may be stopped."""
 
-    kinked = True
+    def replay(self, *arguments):
+        """By `stop_at_replay`."""
+        if stop_at_replay:
+            left, stop = stop_at_replay
+            stop_at_replay[:] = [left - 1, stop] if left else []
+            if not left:
+                raise stop
+        return super().replay(*arguments)
 
 
-def ball(x, u):
-    v = x[1] + 0.05 * (u[0] - 9.81 + 300.0 * jnp.maximum(0.0, -x[0]))
-    return jnp.array([x[0] + 0.05 * v, v])
+KINKED = Restarts(replace(Restarts().flow, tail=40), descent=60, attempts=1)
+STOPS = [(0, Killed), (1, KeyboardInterrupt), (1, Killed), (2, KeyboardInterrupt), (1, Killed)]
 
 
 @pytest.mark.usefixtures("often")
-def test_killed_while_replays_lead_on(tmp_path, monkeypatch):
-    smooth = from_function(
-        ball,
-        x_init=[1.0, 0.0],
-        nu=1,
-        dt=0.05,
-        horizon=2.0,
-        terminal_residual=lambda x: 10.0 * (x - jnp.array([0.9, 0.0])),
-        u_bounds=(-3.0, 3.0),
-        x_scatter=([-0.5, -8.0], [1.5, 8.0]),
-    )
-    dynamics = Bouncing(*(getattr(smooth.dynamics, n) for n in ("function", "dt", "nx", "nu")))
-    solver = Restarts(replace(Restarts().flow, tail=40), descent=60, attempts=1)
-    given = {"problem": replace(smooth, dynamics=dynamics), "solver": solver}
+def test_killed_between_rollouts(tmp_path):
+    given = {"problem": bouncing(Stopped), "solver": KINKED}
     whole, file = solved(**given), tmp_path / "run.ckpt"
-    assert whole.iterations > 100 + 3 * restarts.STEPS  # so it was led on
-    stops = {1: Killed, 3: KeyboardInterrupt, 5: Killed, 8: KeyboardInterrupt, 10: Killed}
-    replayed, calls = restarts._Search._replayed, []
-
-    def stopped(self, *rest):
-        calls.append(rest)
-        if len(calls) in stops:
-            raise stops[len(calls)]
-        return replayed(self, *rest)
-
-    monkeypatch.setattr(restarts._Search, "_replayed", stopped)
-    for count, stop in stops.items():
+    assert whole.iterations > 100 + 3 * Rollouts().iterations  # so there were some
+    for left, stop in STOPS:
+        stop_at_replay[:] = [left, stop]
         if stop is Killed:
             with pytest.raises(Killed):
                 solved(checkpoint=file, **given)
         else:
             assert solved(checkpoint=file, **given).iterations < whole.iterations
-        assert len(calls) == count
+        assert not stop_at_replay  # it came so far
     assert_same(solved(checkpoint=file, **given), whole)
+
+
+@pytest.mark.usefixtures("often")
+def test_a_batch_that_is_killed_between_rollouts(tmp_path):
+    ball, starts = bouncing(Stopped), np.array([[1.0, 0.0], [0.8, 0.5], [1.1, 0.0]], np.float32)
+    given = {"make": lambda x: replace(ball, x_init=x), "values": starts, "solver": KINKED}
+    whole, file = batch(**given), tmp_path / "run.ckpt"
+    for left, stop in STOPS[:-1]:
+        stop_at_replay[:] = [left, stop]
+        if stop is Killed:
+            with pytest.raises(Killed):
+                batch(checkpoint=file, **given)
+        else:
+            assert not np.isfinite(batch(checkpoint=file, **given).cost[2])  # of the next chunk
+        assert not stop_at_replay
+    assert_same(batch(checkpoint=file, **given), whole)
+
+
+class Unused:
+    """The loop over iterations, of which only the text is wanted."""
+
+    lower = iterate.lower
+
+    def __call__(self, *_, **__):
+        pytest.fail("it iterates")
 
 
 def test_what_is_complete_is_not_solved_again(whole, whole_batch, tmp_path, monkeypatch):
@@ -219,8 +242,7 @@ def test_what_is_complete_is_not_solved_again(whole, whole_batch, tmp_path, monk
     first = solved(checkpoint=one)
     batch(checkpoint=many)
     written = one.stat().st_mtime_ns, many.stat().st_mtime_ns
-    monkeypatch.setattr(restarts._Search, "_advanced", None)
-    monkeypatch.setattr("mjx_drax.solution.batch._Search._chunk", None)
+    monkeypatch.setattr(engine, "iterate", Unused())
     again = solved(checkpoint=one)
     assert_same(again, whole)
     assert again.solve_time == pytest.approx(first.solve_time, abs=0.1)
@@ -348,11 +370,11 @@ def test_what_is_no_checkpoint_is_refused(content, words, tmp_path):
 
 
 def test_a_checkpoint_of_another_version_is_refused(written, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "__version__", "9.9")
+    monkeypatch.setattr(digests, "__version__", "9.9")
     with pytest.raises(DraxError, match=r"version.mjx-drax .*, and this solve has .* 9.9"):
         solved(checkpoint=written)
     monkeypatch.setattr(checkpoint, "FORMAT", 9)
-    with pytest.raises(DraxError, match="is a checkpoint of format 1, and this version"):
+    with pytest.raises(DraxError, match="is a checkpoint of format 2, and this version"):
         solved(checkpoint=written)
 
 
@@ -363,20 +385,18 @@ def full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def never(*_):
-    raise AssertionError("it compiles")
-
-
+@pytest.mark.usefixtures("nothing_iterates")
 @pytest.mark.parametrize("call", [solved, batch])
 def test_what_cannot_be_written_is_refused_before_the_solve(call, tmp_path, monkeypatch):
+    fresh = problem()  # for which nothing is compiled yet
+    make = {"make": lambda x: replace(fresh, x_init=x)}
+    given = {"problem": fresh} if call is solved else make
     (tmp_path / "file").touch()
-    monkeypatch.setattr(restarts._Search, "_start", never)
-    monkeypatch.setattr("mjx_drax.solution.batch._Search._begun", never)
     with pytest.raises(DraxError, match="Not a directory"):
-        call(checkpoint=tmp_path / "file" / "run.ckpt")
+        call(checkpoint=tmp_path / "file" / "run.ckpt", **given)
     monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(DraxError, match=r"cannot write '.*run.ckpt': No space left on device"):
-        call(checkpoint=tmp_path / "run.ckpt")
+        call(checkpoint=tmp_path / "run.ckpt", **given)
     assert [f.name for f in tmp_path.iterdir()] == ["file"]
 
 
@@ -405,7 +425,7 @@ def test_a_disk_that_fills_up_ends_no_solve(name, whole, tmp_path, monkeypatch):
 PROGRAM = """
 import sys, time
 import numpy as np
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/.."]
 from mjx_drax.search import checkpoint
 from test_checkpoint import batch, solved
 checkpoint.EVERY, checkpoint.SHARE = 0.0, np.inf
@@ -417,7 +437,8 @@ np.savez(sys.argv[2] + "/answer.npz", one.trajectories.u, one.cost, many.u, many
 """
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 8])
 def test_killed_by_the_system_at_random_moments(kills, whole, whole_batch, tmp_path):
     here, answer = os.path.dirname(__file__), tmp_path / "answer.npz"
     command = [sys.executable, "-c", PROGRAM, here, str(tmp_path)]
