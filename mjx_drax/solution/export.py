@@ -6,13 +6,11 @@ help of the command line lists them at once.
 
 from __future__ import annotations
 
-import os
-import sys
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mjx_drax.base.errors import DraxError, reason, shown
+from mjx_drax.base.imports import imported
 
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
@@ -68,8 +66,6 @@ def exporters() -> dict[str, Exporter]:
 def exporter(text: str) -> Exporter:
     """The exporter of a name in `exporters`, or of a class given as MODULE:CLASS.
 
-    The module may also lie in the current folder.
-
     Raises:
         DraxError: there is no such exporter, or its module or class cannot be used.
     """
@@ -82,16 +78,7 @@ def exporter(text: str) -> Exporter:
             f"there is no exporter {shown(text)}: give one of {', '.join(found)}, or a class of "
             "your own as MODULE:CLASS."
         )
-    sys.path.append(os.getcwd())
-    try:
-        each: Any = getattr(import_module(module), name)
-    except Exception as failure:  # the user's module may raise anything
-        raise DraxError(
-            f"the exporter {shown(text)} cannot be imported: {reason(failure)}. Give MODULE:CLASS, "
-            "of a module that is installed or lies in the current folder."
-        ) from failure
-    finally:
-        sys.path.remove(os.getcwd())
+    each = imported(text)
     if not (isinstance(each, type) and issubclass(each, Exporter)):
         raise DraxError(
             f"the exporter {shown(text)} is {shown(each)}: give a subclass of mjx_drax.Exporter."

@@ -11,11 +11,13 @@ import io
 import json
 import os
 import warnings
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax.base.errors import (
@@ -27,6 +29,7 @@ from mjx_drax.base.errors import (
     shown,
 )
 from mjx_drax.base.files import file_path
+from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.method.model import Multipliers
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
@@ -39,17 +42,16 @@ from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.search.settings import from_data
 from mjx_drax.solution.replay import Replays
+from mjx_drax.solution.results import Results
 from mjx_drax.solution.save import ARRAYS, FORMAT, SUMMARY, json_digest
 
-if TYPE_CHECKING:
-    from mjx_drax.solution.solution import Solution
-
 Arrays = dict[str, np.ndarray]
+Loaded = TypeVar("Loaded", bound=Results)
 
 
 def load(
-    cls: type[Solution], folder: str | os.PathLike[str], problem: Problem | None = None
-) -> Solution:
+    cls: type[Loaded], folder: str | os.PathLike[str], problem: Problem | None = None
+) -> Loaded:
     """The solution in a folder; see `Solution.load`."""
     path = file_path(folder)
     summary, arrays = _read(path)
@@ -114,8 +116,8 @@ def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
 
 
 def _solution(
-    cls: type[Solution], problem: Problem, summary: dict[str, Any], arrays: Arrays
-) -> Solution:
+    cls: type[Loaded], problem: Problem, summary: dict[str, Any], arrays: Arrays
+) -> Loaded:
     multipliers = Multipliers(
         arrays["solution.multipliers.dynamics"],  # type: ignore[arg-type]
         _stagewise("solution.multipliers.constraints", arrays),
@@ -151,7 +153,7 @@ def _solution(
     )
 
 
-def _require_consistent(solution: Solution, summary: dict[str, Any]) -> None:
+def _require_consistent(solution: Results, summary: dict[str, Any]) -> None:
     """Complain about arrays that do not fit each other, and numbers of the wrong kind.
 
     Raises:
@@ -222,6 +224,22 @@ def _missing(what: str) -> Partial:
     return Partial(function)
 
 
+@register_dataclass
+@dataclass(frozen=True)
+class _Manifold(FunctionDynamics):
+    """Dynamics whose states are no vectors: how they differ was not saved."""
+
+    ndx: int = field(default=0, metadata=Static)
+
+    def difference(self, x: Array, y: Array) -> Array:
+        """Complain."""
+        return _missing("difference")()
+
+    def integrate(self, x: Array, dx: Array) -> Array:
+        """Complain."""
+        return _missing("integrate")()
+
+
 def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
     """The problem as far as it was saved."""
     x_init = jnp.asarray(arrays["problem.x_init"])
@@ -253,7 +271,10 @@ def _dynamics(summary: dict[str, Any], arrays: Arrays) -> Dynamics:
     dt = summary["dt"]
     if "model.binary" not in arrays:
         nx, nu = (arrays[f"solution.trajectories.{z}"].shape[-1] for z in "xu")
-        return FunctionDynamics(_missing("f"), dt, nx, nu)
+        sizes = _missing("f"), dt, nx, nu
+        if summary.get("vector_states", True):
+            return FunctionDynamics(*sizes)
+        return _Manifold(*sizes, ndx=arrays["solution.gains"].shape[-1])
     mj_model, source = _model(summary, arrays)
     bounded = bounded_joints(mj_model, np.asarray(arrays["problem.x_init"], float))
     planned = put_model(mj_model, summary["contacts"], bounded)

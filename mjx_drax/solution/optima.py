@@ -1,4 +1,4 @@
-"""The distinct local optima among the chains of a solution: several answers, not only the best.
+"""Which motions belong to the same local optimum: several answers, not only the best.
 
 Only certified chains count: feasible, and a replay of theirs succeeds. How far apart two of them
 are is the root mean square, over the K knots and the ndx coordinates, of the scaled difference of
@@ -29,23 +29,14 @@ here each of these chains goes down its own side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import require_positive
 from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.solution.replay import Certificate
-
-if TYPE_CHECKING:
-    from mjx_drax.solution.solution import Solution
 
 TOLERANCE = 0.25
 """Motions are the same if they differ, in the root mean square, by less than a quarter of the
@@ -56,58 +47,13 @@ LANDMARKS = 512
 """So many are kept, for bounded time; beyond that, chains near none are in no optimum."""
 
 
-@dataclass(frozen=True, eq=False)
-class Optimum:
-    """A local optimum: its cheapest certified chain, and the chains that belong to it.
-
-    Attributes:
-        chain: index of the cheapest chain, which represents it.
-        members: indices of all its chains, cheapest first, (members,).
-        share: of all chains of the solve, those that failed included.
-        cost, max_defect: of the representative.
-        certificate: how the representative replays, open loop and with feedback.
-        trajectory: knots of the representative, x_1..x_K (K, nx) and u_0..u_{K-1} (K, nu).
-        replayed: states (K+1, nx) and controls (K, nu) of its replay: open loop where that
-            succeeds, else with feedback.
-    """
-
-    chain: int
-    members: np.ndarray
-    share: float
-    cost: float
-    max_defect: float
-    certificate: Certificate
-    trajectory: Trajectory
-    replayed: tuple[np.ndarray, np.ndarray]
-
-
-def distinct(solution: Solution, tolerance: float = TOLERANCE) -> tuple[Optimum, ...]:
-    """The distinct optima that the chains found, cheapest first; none if no chain is certified.
-
-    Args:
-        solution: from `solve`.
-        tolerance: distance d within which motions are the same, in standard deviations of the
-            states; a smaller one tells more of them apart.
-
-    Raises:
-        DraxError: the tolerance is not a positive number.
-    """
-    require_positive("tolerance", tolerance, f"a positive number, such as {TOLERANCE}")
-    certified = np.flatnonzero(solution.certified_chains)
-    if not certified.size:
-        return ()
-    order = certified[np.argsort(solution.cost[certified], kind="stable")]
-    group = cluster(solution.problem.dynamics, solution.trajectories.x[order], tolerance)
-    return tuple(_optimum(solution, order[group == g]) for g in range(group.max() + 1))
-
-
 def cluster(dynamics: Dynamics, states: ArrayLike, tolerance: float = TOLERANCE) -> np.ndarray:
     """Which optimum each motion belongs to, (n,): 0, 1, ... in order of appearance, -1 for none.
 
     Args:
         dynamics: whose `difference` compares states.
         states: x_1..x_K of every motion, cheapest first, (n, K, nx).
-        tolerance: see `distinct`.
+        tolerance: distance d within which motions are the same.
     """
     motions = jnp.asarray(states)
     scale = _spread(dynamics, motions)
@@ -144,22 +90,3 @@ def _distances(dynamics: Dynamics, motions: Array, landmark: Array, scale: Array
     """d of every motion (n, K, nx) from one (K, nx), (n,)."""
     difference = jax.vmap(jax.vmap(dynamics.difference), (0, None))
     return jnp.sqrt(jnp.square(difference(motions, landmark) / scale).mean(axis=(1, 2)))
-
-
-def _optimum(solution: Solution, members: np.ndarray) -> Optimum:
-    """What is known of the chains of one optimum, cheapest first."""
-    from mjx_drax.solution.replay import Certificate
-
-    chain = int(members[0])
-    open_loop, feedback = solution.open_loop, solution.feedback
-    replays = open_loop if open_loop.success[chain] else feedback
-    return Optimum(
-        chain=chain,
-        members=members,
-        share=len(members) / solution.chains,
-        cost=float(solution.cost[chain]),
-        max_defect=float(solution.max_defect[chain]),
-        certificate=Certificate(solution.engine, open_loop.summary(chain), feedback.summary(chain)),
-        trajectory=jax.tree.map(lambda a: a[chain], solution.trajectories),
-        replayed=(replays.states[chain], replays.controls[chain]),
-    )

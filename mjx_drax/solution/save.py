@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,13 +23,11 @@ from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path, json_data, require_room, write_json
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.source import binary
+from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.settings import to_data
-from mjx_drax.solution.optima import Optimum
-
-if TYPE_CHECKING:
-    from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.results import Optimum, Results
 
 SUMMARY, ARRAYS = "result.json", "result.npz"
 
@@ -46,7 +44,7 @@ OPTIMA = 32
 """So many of the distinct optima, cheapest first, go into result files."""
 
 
-def summary(solution: Solution) -> dict[str, Any]:
+def summary(solution: Results) -> dict[str, Any]:
     """What `result.json` holds: settings, the best chain's numbers, certificate, versions."""
     best, certificate = solution.best_chain, solution.certificate
     status, dynamics = solution.status, solution.problem.dynamics
@@ -60,6 +58,7 @@ def summary(solution: Solution) -> dict[str, Any]:
         "dt": float(solution.problem.dynamics.dt),
         "has_goal": solution.problem.goal is not None,
         "contacts": dynamics.contacts if isinstance(dynamics, MjxDynamics) else None,
+        "vector_states": type(dynamics).difference is Dynamics.difference,
         "settings": to_data(solution.solver),
         "compile_time_s": solution.compile_time,
         "solve_time_s": solution.solve_time,
@@ -84,7 +83,7 @@ def summary(solution: Solution) -> dict[str, Any]:
     return data
 
 
-def arrays(solution: Solution) -> dict[str, np.ndarray]:
+def arrays(solution: Results) -> dict[str, np.ndarray]:
     """What `result.npz` holds: the best chain, its replay, and numbers of every chain.
 
     times (K+1,); states (K+1, nx), controls (K, nu), multipliers (K, ndx) and gains (K, nu, ndx) of
@@ -143,7 +142,7 @@ def _answer(optimum: Optimum) -> dict[str, Any]:
     }
 
 
-def _whole(solution: Solution) -> dict[str, np.ndarray]:
+def _whole(solution: Results) -> dict[str, np.ndarray]:
     """All that a solution holds, but what `arrays` names besides."""
     problem = solution.problem
     parts = {
@@ -176,7 +175,7 @@ def _flat(label: str, part: Any) -> Iterator[tuple[str, np.ndarray]]:
         yield label, np.asarray(part)
 
 
-def save(solution: Solution, folder: str | os.PathLike[str]) -> Path:
+def save(solution: Results, folder: str | os.PathLike[str]) -> Path:
     """Write result.json and result.npz into a folder, each at once or not at all.
 
     `Solution.load` reads them again. result.json knows its own digest, and that of the result.npz

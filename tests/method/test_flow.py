@@ -125,7 +125,7 @@ class Kinked(FunctionDynamics):
 
 
 def test_states_are_damped_less_where_f_has_kinks():
-    """A full step is -(H + mu J'J + delta D)^-1 grad; another `state_damping` does not recompile."""
+    """A full step is -(H + mu J'J + delta D)^-1 grad; another number does not recompile."""
     quiet, problem, delta, mu = Langevin(noise=Constant(0.0)), program(), 0.3, 5.0
     f = problem.dynamics
     kinked = replace(problem, dynamics=Kinked(f.function, f.dt, f.nx, f.nu))

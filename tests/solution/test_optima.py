@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mjx_drax import DraxError, Langevin, cli, from_function
+from mjx_drax import DraxError, Langevin, from_function
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.cli import _optima, main
-from mjx_drax.problem.dynamics import FunctionDynamics, as_partial
+from mjx_drax.cli import main
+from mjx_drax.cli.summary import optima_lines
+from mjx_drax.problem.cost import as_partial
+from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.solution import optima
 from mjx_drax.solution import save as results
-from mjx_drax.solution.optima import TOLERANCE, cluster, distinct
-from mjx_drax.solution.solution import solve
+from mjx_drax.solution.optima import TOLERANCE, cluster
+from mjx_drax.solution.results import distinct
+from mjx_drax.solution.solve import solve
 from mjx_drax.view import plotting
 from mjx_drax.view.plotting import plot_optima
 
@@ -208,7 +211,7 @@ def test_success_with_feedback_alone_counts_and_is_what_was_replayed(hill):
 def test_none_certified_none_found(hill, tmp_path):
     none = failed(hill, range(hill.chains))
     assert none.optima == ()
-    assert _optima(none) == []
+    assert optima_lines(none) == []
     assert results.summary(none)["optima"] == []
     arrays = results.arrays(none)
     assert arrays["optima_states"].shape == (0, 21, 4)
@@ -255,21 +258,21 @@ def test_result_files_and_tables_are_bounded(hill, monkeypatch):
     summary = results.summary(many)
     assert (summary["optima_found"], len(summary["optima"])) == (found, 3)
     assert results.arrays(many)["optima_states"].shape == (3, 21, 4)
-    monkeypatch.setattr(cli, "OPTIMA", 3)
-    lines = _optima(many)
+    monkeypatch.setattr("mjx_drax.cli.summary.OPTIMA", 3)
+    lines = optima_lines(many)
     assert len(lines) == 5  # a heading, three rows, how many more
     assert lines[-1].split() == ["and", str(found - 3), "more"]
 
 
 def test_table_tells_cost_share_and_replays(hill):
-    heading, first, second = _optima(hill)
+    heading, first, second = optima_lines(hill)
     assert " ".join(heading.split()) == "optima rank cost chains open loop with feedback"
     for rank, line in enumerate((first, second), 1):
         optimum = hill.optima[rank - 1]
         assert line.split()[:3] == [str(rank), f"{optimum.cost:.5g}", f"{optimum.share:.1%}"]
         assert " ".join(line.split()[3:]) == "reaches goal reaches goal"
     lost = replace(hill, open_loop=replace(hill.open_loop, success=np.zeros(16, bool)))
-    assert " ".join(_optima(lost)[1].split()[3:]) == "misses goal reaches goal"
+    assert " ".join(optima_lines(lost)[1].split()[3:]) == "misses goal reaches goal"
 
 
 def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
@@ -294,7 +297,7 @@ def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
 
 
 def test_the_command_writes_a_picture_only_of_several(tmp_path, capsys, monkeypatch, hill):
-    monkeypatch.setattr("mjx_drax.solution.solution.solve", lambda *_, **__: hill)
+    monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: hill)
     arguments = f"solve pendulum --no-video --out {tmp_path}".split()
     assert main(arguments) == 0
     out = capsys.readouterr().out
@@ -303,7 +306,7 @@ def test_the_command_writes_a_picture_only_of_several(tmp_path, capsys, monkeypa
     assert (tmp_path / "optima.png").stat().st_size > 1000
     (tmp_path / "optima.png").unlink()
     one = failed(hill, hill.optima[1].members)
-    monkeypatch.setattr("mjx_drax.solution.solution.solve", lambda *_, **__: one)
+    monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: one)
     assert main(arguments) == 0
     assert "optima         one" in capsys.readouterr().out
     assert not (tmp_path / "optima.png").exists()
