@@ -17,8 +17,9 @@ from jax import Array
 
 from mjx_drax.base.errors import DraxError, require_part, require_whole, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.method.bounds import Bounds
 from mjx_drax.method.langevin import Langevin
-from mjx_drax.method.metrics import Identity
+from mjx_drax.method.metrics import Identity, Metric
 from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem, functions_of
@@ -43,22 +44,45 @@ def check_flow(flow: Langevin, problem: Problem) -> None:
         if not callable(schedule) or isinstance(schedule, type):
             number = shown(schedule) if np.isscalar(schedule) else "0.1"
             raise DraxError(f"{name} is {shown(schedule)}: give a schedule, Constant({number}).")
-    require_part("preconditioner", flow.preconditioner, "direction", "GaussNewton()")
-    require_part("bounds", flow.bounds, "confine", "LogBarrier()")
-    if flow.preconditioner.derivatives is not None:
-        by = flow.preconditioner.derivatives
+        _require_registered(name, schedule)
+    _check_part("preconditioner", flow.preconditioner, Metric, "direction", "GaussNewton()")
+    _check_part("bounds", flow.bounds, Bounds, "confine", "LogBarrier()")
+    by = flow.preconditioner.derivatives
+    if by is not None:
         require_part("preconditioner.derivatives", by, "jacobian", "Autodiff()")
+        _require_registered("preconditioner.derivatives", by)
     _check_numbers(flow)
     _check_adjusted(flow, problem)
     _check_derivatives(flow, problem)
 
 
+def _check_part(name: str, part: Any, base: type, method: str, example: str) -> None:
+    """Complain about a part that is none, or a user's own that is not made as ours are."""
+    require_part(name, part, method, example)
+    if not isinstance(part, base):
+        wanted = f"mjx_drax.{base.__name__}"
+        raise DraxError(f"{name} is {shown(part)}: make its class inherit {wanted}.")
+    _require_registered(name, part)
+
+
+def _require_registered(name: str, part: Any) -> None:
+    """Complain about a part that a compiled function could not take, or a file not hold."""
+    if not is_dataclass(part) or jax.tree_util.all_leaves([part]):
+        raise DraxError(
+            f"{name} is {shown(part)}, no registered dataclass: make its class one, with "
+            "@mjx_drax.register_dataclass and @dataclass(frozen=True)."
+        )
+
+
 def _check_numbers(part: Any, prefix: str = "") -> None:
-    """Complain about a setting that is no number, or one that makes no sense."""
+    """Complain about a setting of ours that is no number, or one that makes no sense."""
+    ours = type(part).__module__.startswith("mjx_drax.")
     for setting in fields(part):
         value, name = getattr(part, setting.name), prefix + setting.name
         if is_dataclass(value):
             _check_numbers(value, f"{name}.")
+        elif not ours:  # what numbers of a user's own part mean is not known here
+            continue
         elif setting.name in _COUNTS:
             require_whole(name, value)
         elif value is not None and not callable(value):

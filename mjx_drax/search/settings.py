@@ -11,11 +11,13 @@ import ast
 import sys
 from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, reason, shown
+from mjx_drax.base.imports import imported
 from mjx_drax.base.pytrees import REGISTERED
 from mjx_drax.method.schedules import Constant, Geometric
 from mjx_drax.search.restarts import Restarts
@@ -91,20 +93,14 @@ def _class_named(name: Any, imports: bool) -> Any:
     module, _, cls = name.rpartition(":")
     if not module:
         found = getattr(import_module("mjx_drax"), cls)
+    elif imports:
+        found = imported(name)
+    elif module in sys.modules:
+        found = attrgetter(cls)(sys.modules[module])
     else:
-        if imports:
-            try:
-                import_module(module)
-            except ImportError as error:
-                raise DraxError(f"{name} cannot be imported: {reason(error)}.") from error
-        if module not in sys.modules:
-            raise DraxError(
-                f"settings hold a {cls} of the module {module}: import {module} before you load "
-                "them."
-            )
-        found = sys.modules[module]
-        for part in cls.split("."):
-            found = getattr(found, part)
+        raise DraxError(
+            f"settings hold a {cls} of the module {module}: import {module} before you load them."
+        )
     if not (isinstance(found, type) and is_dataclass(found)):
         raise TypeError(f"{name} is no class of settings")
     return found
@@ -143,7 +139,8 @@ def changed(solver: Restarts, name: str, text: str) -> Restarts:
 
 def _changed(part: Any, path: list[str], name: str, text: str) -> Any:
     old = getattr(part, path[0])
-    kind = next(str(field.type) for field in fields(part) if field.name == path[0])
+    annotation: Any = next(field.type for field in fields(part) if field.name == path[0])
+    kind = getattr(annotation, "__name__", str(annotation))  # a text, or a class
     inner = _changed(old, path[1:], name, text) if len(path) > 1 else _value(old, kind, name, text)
     new = {path[0]: inner}
     if isinstance(part, Geometric) and path[0] == "end" and part.final == part.end:
@@ -199,6 +196,8 @@ def _part(role: str | None, name: str, text: str) -> Any:
         part = _class_named(cls.strip(), imports=True)(*arguments, **named)
         if role is not None and not hasattr(part, role):
             raise TypeError(f"it is not {_ROLES[role]}")
+    except DraxError:
+        raise
     except (AttributeError, TypeError, ValueError, SyntaxError) as error:
         if role == "__call__":
             raise DraxError(f"{name} is {text!r}: {_WANTED_SCHEDULE}") from error
