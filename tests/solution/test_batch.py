@@ -107,6 +107,59 @@ def test_finished_problems_leave_the_batch():
     assert done == [(3, 5), (5, 5)]
 
 
+def test_only_problems_that_are_not_done_are_tried_again():
+    walls = replace(BASE.bounds, x_lower=jnp.array([-1.0, -10.0]), x_upper=jnp.array([1.0, 10.0]))
+    starts = np.array([[0.0, 0.0], [0.9, 9.0], [0.1, 0.0]])  # the second one hits the wall
+    done = []
+
+    def solved(values, **rest):
+        return solve_batch(
+            lambda x: replace(BASE, x_init=x, bounds=walls), values, 2, solver=SOLVER, **rest
+        )
+
+    found = solved(starts, chunk=1, progress=lambda *n: done.append(n))
+    assert done == [(1, 3), (2, 3), (3, 3), (3, 3), (3, 3)]  # two more attempts on one of three
+    np.testing.assert_array_equal(found.feasible, [True, False, True])
+    others = solved(starts[[0, 0, 2]], chunk=1)
+    np.testing.assert_array_equal(found.u[[0, 2]], others.u[[0, 2]])
+
+
+@pytest.mark.parametrize("chunks", [1, 2])
+def test_ctrl_c_keeps_what_there_is(whole, chunks):
+    done, solved = [], np.arange(5) < 2 * chunks
+
+    def interrupt(*numbers):
+        done.append(numbers)
+        if len(done) == chunks:
+            raise KeyboardInterrupt
+
+    found = solve_batch(from_start, STARTS, 3, solver=SOLVER, chunk=2, progress=interrupt)
+    np.testing.assert_array_equal(found.certified, solved)
+    np.testing.assert_allclose(found.u[solved], whole.u[solved], 1e-4, 1e-4)
+    np.testing.assert_allclose(found.chain_cost[solved], whole.chain_cost[solved], 1e-4, 1e-4)
+    assert (found.cost[~solved] == np.inf).all()
+    assert (found.max_defect[~solved] == np.inf).all()
+
+
+def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
+    done = []
+
+    def interrupt(*numbers):
+        done.append(numbers)
+        if len(done) == 4:  # the first of three chunks, in the second attempt
+            raise KeyboardInterrupt
+
+    def solved(solver, progress=None):
+        return solve_batch(from_start, STARTS, 3, solver=solver, chunk=2, progress=progress)
+
+    solver = replace(SOLVER, enough=2.0)
+    first, kept = solved(replace(solver, attempts=1)), solved(solver, interrupt)
+    assert kept.certified.all()
+    assert (kept.chain_cost[:2] <= first.chain_cost[:2]).all()
+    np.testing.assert_array_equal(kept.u[2:], first.u[2:])
+    np.testing.assert_array_equal(kept.chain_cost[2:], first.chain_cost[2:])
+
+
 PENDULUM = """
 <mujoco>
   <option timestep="0.02"/>

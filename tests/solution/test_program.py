@@ -21,7 +21,7 @@ from mjx_drax import (
     Trajectory,
     from_function,
 )
-from mjx_drax.method.langevin import advance
+from mjx_drax.search.iterate import advance, start
 from mjx_drax.solution.program import from_program, minimize
 
 
@@ -85,12 +85,12 @@ def test_a_residual_is_half_its_square(linear):
 def test_without_noise_the_papers_flow_is_the_differential_multiplier_method(linear):
     x, multipliers = np.array([1.0, -1.0, 2.0]), np.zeros(2)
     knots = Trajectory(jnp.zeros((1, 1, 0)), jnp.asarray(x)[None, None])
-    state = PLATT_BARR.init(linear, knots, jax.random.key(0))
+    state = start(PLATT_BARR, linear, knots, jax.random.key(0))
     for i in range(25):
         h = A @ x - b
         slope = Q @ x + q + A.T @ (multipliers + MU * h)
         x, multipliers = x - ALPHA * slope, multipliers + 2 * ALPHA * MU * h
-        state = advance(PLATT_BARR, linear, state, i, i + 1)
+        state, _ = advance(PLATT_BARR, linear, state, i, i + 1)
         np.testing.assert_allclose(state.trajectory.u[0, 0], x, rtol=1e-12)
         rows = state.multipliers.constraints.stage[0, 0]
         np.testing.assert_allclose(rows, multipliers, rtol=1e-12)

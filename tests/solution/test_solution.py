@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf
-from mjx_drax.method.langevin import evaluate
-from mjx_drax.search import restarts
-from mjx_drax.search.restarts import CHUNK
-from mjx_drax.solution.solution import TRACKED, _replays, solve
+from mjx_drax.search import engine
+from mjx_drax.search.engine import REPORT_EVERY
+from mjx_drax.search.iterate import evaluate, iterate
+from mjx_drax.solution.replay import TRACKED, replays
+from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 
 OPTIMUM = 0.031774  # of the pendulum: 600 of 600 IPOPT multistarts agree
@@ -93,12 +94,12 @@ def test_certificate_tells_what_the_best_chain_did(pendulum):
     assert certificate.success
     assert "float64" in certificate.engine
     for label in ("open_loop", "feedback"):
-        told, replays = getattr(certificate, label), getattr(pendulum, label)
+        told, found = getattr(certificate, label), getattr(pendulum, label)
         assert set(told) == {"max_deviation", "final_deviation", "max_violation", "cost", "success"}
         assert told["success"] is True
         assert told["cost"] == pytest.approx(OPTIMUM, rel=0.01)
-        assert 0 <= told["final_deviation"] <= told["max_deviation"] == replays.max_deviation[c]
-        assert replays.states.dtype == np.float64
+        assert 0 <= told["final_deviation"] <= told["max_deviation"] == found.max_deviation[c]
+        assert found.states.dtype == np.float64
     states, controls = pendulum.replayed
     np.testing.assert_array_equal(states, pendulum.open_loop.states[c])
     np.testing.assert_array_equal(controls, pendulum.open_loop.controls[c])
@@ -112,7 +113,7 @@ def test_solution_keeps_status_and_history(pendulum):
     assert (pendulum.died_at == -1).all()
     assert ((pendulum.converged_at > 0) == pendulum.feasible).all()
     history = pendulum.history
-    np.testing.assert_array_equal(history["iteration"], np.arange(0, total + 1, CHUNK))
+    np.testing.assert_array_equal(history["iteration"], np.arange(0, total + 1, REPORT_EVERY))
     np.testing.assert_array_equal(history["cost"][-1], pendulum.cost)
     np.testing.assert_array_equal(history["max_defect"][-1], pendulum.max_defect)
     for c in np.flatnonzero(pendulum.feasible):
@@ -127,11 +128,11 @@ def test_a_replay_that_leaves_the_bounds_of_the_states_is_no_success(pendulum):
     for share, succeeds in ((1.1, pendulum.open_loop.success), (0.9, False)):
         ends = share * extent
         narrow = replace(problem, bounds=replace(problem.bounds, x_lower=-ends, x_upper=ends))
-        replays = _replays(narrow, pendulum.trajectories, gains)
+        found = replays(narrow, pendulum.trajectories, gains)
         np.testing.assert_array_equal(
-            replays.success & pendulum.feasible, succeeds & pendulum.feasible
+            found.success & pendulum.feasible, succeeds & pendulum.feasible
         )
-        assert (replays.max_violation[pendulum.feasible] > 0.05).all() != np.any(succeeds)
+        assert (found.max_violation[pendulum.feasible] > 0.05).all() != np.any(succeeds)
 
 
 def test_feedback_tracks_where_open_loop_drifts(pendulum):
@@ -154,13 +155,13 @@ def test_a_plan_that_was_rolled_out_deviates_by_nothing():
     problem = reach()
     u = np.random.default_rng(0).uniform(-1, 1, (3, K, 1)).astype(np.float32)
     plan = rollout(problem, u.astype(float))
-    replays = _replays(problem, Trajectory(plan[:, 1:], u), np.ones((3, K, 1, 2)))
-    np.testing.assert_allclose(replays.states, plan, atol=1e-6)
-    np.testing.assert_allclose(replays.controls, u, atol=1e-6)
-    assert replays.max_deviation.max() < 1e-6
-    assert replays.success.all()  # without a goal: it ends where it was planned to
+    found = replays(problem, Trajectory(plan[:, 1:], u), np.ones((3, K, 1, 2)))
+    np.testing.assert_allclose(found.states, plan, atol=1e-6)
+    np.testing.assert_allclose(found.controls, u, atol=1e-6)
+    assert found.max_deviation.max() < 1e-6
+    assert found.success.all()  # without a goal: it ends where it was planned to
     trajectory = Trajectory(plan[:, 1:].astype(np.float32), u)
-    np.testing.assert_allclose(replays.cost, evaluate(problem, trajectory).cost, rtol=1e-5)
+    np.testing.assert_allclose(found.cost, evaluate(problem, trajectory).cost, rtol=1e-5)
 
 
 def test_wrong_controls_are_no_success():
@@ -168,32 +169,32 @@ def test_wrong_controls_are_no_success():
     u = np.full((2, K, 1), 0.5, np.float32)
     plan = rollout(problem, u.astype(float))
     u[1, 0] += 2 * TRACKED / (DT * K * DT)
-    replays = _replays(problem, Trajectory(plan[:, 1:], u), np.zeros((2, K, 1, 2)))
-    np.testing.assert_array_equal(replays.success, [True, False])
+    found = replays(problem, Trajectory(plan[:, 1:], u), np.zeros((2, K, 1, 2)))
+    np.testing.assert_array_equal(found.success, [True, False])
     expected = 2 * TRACKED / (K * DT) * np.array([(K - 1) * DT, 1.0]).max()
-    assert replays.final_deviation[1] == pytest.approx(expected, rel=1e-3)
+    assert found.final_deviation[1] == pytest.approx(expected, rel=1e-3)
 
 
 def test_with_a_goal_success_is_where_the_replay_ends_not_where_the_plan_does():
     problem = reach(goal=near)
     still, arrived = np.zeros((1, K, 1), np.float32), np.tile([1.0, 0.0], (1, K, 1))
-    assert not _replays(problem, Trajectory(arrived, still), np.zeros((1, K, 1, 2))).success[0]
+    assert not replays(problem, Trajectory(arrived, still), np.zeros((1, K, 1, 2))).success[0]
 
 
 def test_replays_respect_the_control_bounds():
     problem = reach(u_bounds=([-1.0], [0.5]))
     u, plan = np.array([[[9.0], [-9.0]] * (K // 2)]), np.zeros((1, K, 2))
-    replays = _replays(problem, Trajectory(plan, u), np.full((1, K, 1, 2), 3.0))
-    assert replays.controls.min() >= -1
-    assert replays.controls.max() <= 0.5
+    found = replays(problem, Trajectory(plan, u), np.full((1, K, 1, 2), 3.0))
+    assert found.controls.min() >= -1
+    assert found.controls.max() <= 0.5
 
 
 def test_a_replay_that_turns_nan_is_no_success():
     problem = reach(goal=lambda x: True)
     u = np.full((1, K, 1), np.nan)
-    replays = _replays(problem, Trajectory(np.zeros((1, K, 2)), u), np.zeros((1, K, 1, 2)))
-    assert not replays.success[0]
-    assert replays.max_deviation[0] == np.inf
+    found = replays(problem, Trajectory(np.zeros((1, K, 2)), u), np.zeros((1, K, 1, 2)))
+    assert not found.success[0]
+    assert found.max_deviation[0] == np.inf
 
 
 @pytest.mark.parametrize("control", [np.nan, 1e30])
@@ -212,7 +213,7 @@ def test_what_blows_up_in_the_c_engine_is_no_success(control, tmp_path, monkeypa
         np.zeros((1, K + 1, 2)), u, np.zeros((1, K, 1, 2)), (np.array(-np.inf), np.array(np.inf))
     )
     assert not np.isfinite(states[0, -1]).all()
-    assert not _replays(problem, Trajectory(plan, u), np.zeros((1, K, 1, 2))).success[0]
+    assert not replays(problem, Trajectory(plan, u), np.zeros((1, K, 1, 2))).success[0]
 
 
 # Solves.
@@ -247,13 +248,13 @@ def test_ctrl_c_between_reports_keeps_what_there_is():
 
     def progress(done, total, info):
         seen.append((done, total))
-        if done == 2 * CHUNK:
+        if done == 2 * REPORT_EVERY:
             raise KeyboardInterrupt
 
     solution = solve(reach(), chains=3, solver=QUICK, progress=progress)
-    assert seen == [(CHUNK, 80), (2 * CHUNK, 80)]
-    assert solution.iterations == 2 * CHUNK
-    np.testing.assert_array_equal(solution.history["iteration"], [0, CHUNK, 2 * CHUNK])
+    assert seen == [(REPORT_EVERY, 80), (2 * REPORT_EVERY, 80)]
+    assert solution.iterations == 2 * REPORT_EVERY
+    np.testing.assert_array_equal(solution.history["iteration"], [0, REPORT_EVERY, 2 * REPORT_EVERY])
     short = solve(reach(), chains=3, solver=QUICK, progress=progress)
     np.testing.assert_array_equal(short.trajectories.x, solution.trajectories.x)
 
@@ -262,18 +263,16 @@ def test_ctrl_c_between_reports_keeps_what_there_is():
 def test_ctrl_c_during_an_iteration_reports_the_numbers_of_the_chains_it_returns(call, monkeypatch):
     calls = []
 
-    advance_ = restarts._advance
-
     def interrupted(*arguments, **options):
         calls.append(None)  # the first only compiles
         if len(calls) == call:
             raise KeyboardInterrupt
-        return advance_(*arguments, **options)
+        return iterate(*arguments, **options)
 
-    monkeypatch.setattr(restarts, "_advance", interrupted)
+    monkeypatch.setattr(engine, "iterate", interrupted)
     solution = solve(reach(), chains=3, solver=QUICK)
     info = evaluate(solution.problem, solution.trajectories)
-    assert solution.iterations == (call - 2) * CHUNK
+    assert solution.iterations == (call - 2) * REPORT_EVERY
     np.testing.assert_allclose(solution.max_defect, info.max_defect, rtol=1e-6)
     np.testing.assert_allclose(solution.cost, info.cost, rtol=1e-6)
 
@@ -300,7 +299,7 @@ def no_compilation(monkeypatch):
     def fail(*arguments):
         pytest.fail("the solver was compiled")
 
-    monkeypatch.setattr(restarts, "_advance", fail)
+    monkeypatch.setattr(engine, "iterate", fail)
 
 
 @pytest.mark.parametrize(
@@ -387,9 +386,9 @@ def test_problems_that_are_refused(arguments, words):
 
 @pytest.mark.slow
 def test_cartpole_swings_up_from_mjcf():
-    task, before = load("cartpole_swingup"), restarts._advance._cache_size()
+    task, before = load("cartpole_swingup"), iterate._cache_size()
     solution = solve(task.make(), chains=4)
-    assert restarts._advance._cache_size() - before == 1
+    assert iterate._cache_size() - before == 1
     assert solution.success_rate > 0.5
     assert solution.certified
     assert f"MuJoCo {mujoco.__version__} C engine" in solution.certificate.engine
