@@ -83,15 +83,15 @@ def restart_at(own: Question, shared: Question, states: State, knots: Trajectory
     return State(**{**vars(states), "trajectory": inside})
 
 
-@partial(compiled, static_argnames="tail")
-@full_precision
-def iterate(
+def loop(
     rows: tuple[State, Question],
     shared: Question,
     start: ArrayLike,
     stop: ArrayLike,
     tail: bool = True,
-) -> tuple[State, Info]:
+    noise: bool = True,
+    diagnose: bool = True,
+) -> tuple[State, Any]:
     """Iterations start..stop-1 of every chain, and diagnostics of where they end.
 
     Both ends are traced: any number of iterations runs the same compiled loop, and none at all
@@ -103,21 +103,9 @@ def iterate(
         rows: the chains, and what differs from row to row.
         shared: what does not.
         start, stop: iterations.
-        tail: as in `Langevin.step` (static).
+        tail, noise: as in `Langevin.step` (static).
+        diagnose: whether diagnostics are asked for (static); None takes their place.
     """
-    return loop(rows, shared, start, stop, tail)
-
-
-def loop(
-    rows: tuple[State, Question],
-    shared: Question,
-    start: ArrayLike,
-    stop: ArrayLike,
-    tail: bool = True,
-    noise: bool = True,
-    diagnose: bool = True,
-) -> tuple[State, Any]:
-    """`iterate`, inside of a compiled function; without diagnostics if not asked to `diagnose`."""
     states, own = rows
 
     def one(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
@@ -147,6 +135,10 @@ def loop(
         return diagnosed(q.problem, knots, q.problem.values(knots))
 
     return states, _by_row(shared, own, diagnosis, states.trajectory)
+
+
+iterate = compiled(full_precision(loop), static_argnames=("tail", "noise", "diagnose"))
+"""`loop` as a program of its own."""
 
 
 @jax.jit

@@ -1,11 +1,13 @@
 """Two checkouts of this project side by side on one machine: compile and solve times of tasks.
 
-    python -m mjx_drax.studies.side_by_side OLD NEW [TASK[:CHAINS] ...] [--repeats N] [--out FILE]
+    python -m mjx_drax.studies.side_by_side OLD NEW [TASK[:CHAINS[xPROBLEMS]] ...] [--repeats N]
+
+With PROBLEMS so many initial states near the task's are solved by one `solve_batch`.
 
 OLD and NEW are folders of checkouts. Each is run in processes of its own, in turn (old, new, old,
 new, ...), without a cache of compiled programs. Of each task the first solve of a process gives the
 compile time; the solve time is the median over further seeds. Only what both versions have is
-called: `mjx_drax.tasks.load` and `mjx_drax.solve`.
+called: `mjx_drax.tasks.load`, `mjx_drax.solve` and `mjx_drax.solve_batch`.
 """
 
 from __future__ import annotations
@@ -23,21 +25,39 @@ import numpy as np
 
 from mjx_drax.base.files import write_json
 
-TASKS = ("pendulum:16384", "cartpole_swingup:1024", "acrobot_swingup:256", "bug_trap:1024")
+TASKS = (
+    "pendulum:16384",
+    "pendulum:4x4096",
+    "cartpole_swingup:1024",
+    "acrobot_swingup:256",
+    "bug_trap:1024",
+)
 
 CHILD = """
 import json, sys
+from dataclasses import replace
 import numpy as np
 import mjx_drax, mjx_drax.tasks
+
+def solved(problem, chains, count, seed):
+    if not count:
+        found = mjx_drax.solve(problem, chains=chains, seed=seed)
+        return found, found.success_rate, found.cost[found.best_chain]
+    off = np.random.default_rng(seed).uniform(-0.1, 0.1, (count, problem.dynamics.nx))
+    starts = np.asarray(problem.x_init) + off
+    found = mjx_drax.solve_batch(lambda x: replace(problem, x_init=x), starts, chains, seed)
+    return found, found.certified.mean(), np.median(found.cost)
+
 for word in sys.argv[2:]:
-    name, _, chains = word.partition(":")
+    name, _, numbers = word.partition(":")
+    chains, _, count = numbers.partition("x")
     problem, rows = mjx_drax.tasks.load(name).make(), []
     for seed in range(int(sys.argv[1])):
-        found = mjx_drax.solve(problem, chains=int(chains or 64), seed=seed)
-        rows.append([found.compile_time, found.solve_time, found.success_rate,
-                     float(found.cost[found.best_chain])])
-    print(json.dumps({"task": word, "compile": rows[0][0], "solves": [r[1] for r in rows],
-                      "success": [r[2] for r in rows], "cost": [r[3] for r in rows]}), flush=True)
+        found, share, cost = solved(problem, int(chains or 64), int(count or 0), seed)
+        rows.append([found.compile_time, found.solve_time, float(share), float(cost)])
+    compile, solves, success, costs = map(list, zip(*rows))
+    print(json.dumps({"task": word, "compile": compile[0], "solves": solves,
+                      "success": success, "cost": costs}), flush=True)
 """
 
 
