@@ -27,8 +27,9 @@ _ROLES = {
     "confine": "a handling of bounds",
     "jacobian": "a way to differentiate",
     "__call__": "a schedule",
+    "rounds": "a setting of rollouts",
 }
-"""What a part of a solver is, by the method that it has; parts of one role are exchangeable."""
+"""What a part of a solver is, by an attribute that it has; parts of one role are exchangeable."""
 
 
 def to_data(value: Any) -> Any:
@@ -151,13 +152,13 @@ def _changed(part: Any, path: list[str], name: str, text: str) -> Any:
 def _value(old: Any, kind: str, name: str, text: str) -> Any:
     """The text as a value of the kind that the field's annotation says."""
     role = next((method for method in _ROLES if hasattr(old, method)), None)
-    role = "jacobian" if "Differentiator" in kind else role
+    role = "jacobian" if "Differentiator" in kind else "rounds" if "Rollouts" in kind else role
     value = _literal(text)
     if role == "__call__" and not isinstance(value, str):
         return _schedule(name, text, value)
     if value is None and "None" in kind:
         return None
-    if role is not None or is_dataclass(old) or "Rollouts" in kind:
+    if role is not None or is_dataclass(old):
         return _part(role, name, text)
     if "bool" in kind:
         fits, wanted = isinstance(value, bool), "True or False"
@@ -201,7 +202,10 @@ def _part(role: str | None, name: str, text: str) -> Any:
     except (AttributeError, TypeError, ValueError, SyntaxError) as error:
         if role == "__call__":
             raise DraxError(f"{name} is {text!r}: {_WANTED_SCHEDULE}") from error
-        known = sorted(_name_of(c) for c in REGISTERED if role is not None and hasattr(c, role))
+        package = import_module("mjx_drax")
+        there = [*REGISTERED, *(getattr(package, public) for public in package.__all__)]
+        parts = {c for c in there if isinstance(c, type) and is_dataclass(c)}
+        known = sorted(_name_of(c) for c in parts if role is not None and hasattr(c, role))
         raise DraxError(
             f"{name} is {text!r}: give one of {', '.join(known)}, or MODULE:CLASS for one of your "
             "own."

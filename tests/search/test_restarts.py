@@ -119,14 +119,10 @@ def test_ctrl_c_between_two_attempts_keeps_the_answers_of_the_first():
     problem = replace(PROGRAM, guess=guess)
     first = search(Restarts(SHORT, attempts=1), problem=problem)
     before = len(drawn)
-    kept = search(
-        Restarts(SHORT), problem=problem, progress=lambda done, *_: reports.append(done)
-    )
+    kept = search(Restarts(SHORT), problem=problem, progress=lambda done, *_: reports.append(done))
     assert len(drawn) == before + 2  # once for each attempt
     assert kept.records[-1][0] == 120
-    np.testing.assert_array_equal(
-        kept.chains.state.trajectory.u, first.chains.state.trajectory.u
-    )
+    np.testing.assert_array_equal(kept.chains.state.trajectory.u, first.chains.state.trajectory.u)
 
 
 def attempt(costs, defects, label):
@@ -155,9 +151,7 @@ def test_a_langevin_is_one_attempt_as_it_stands():
     found = search(SHORT, chains=4)
     assert found.records[-1][0] == 60
     again = search(Restarts(SHORT, descent=None, attempts=1), chains=4)
-    np.testing.assert_array_equal(
-        found.chains.state.trajectory.u, again.chains.state.trajectory.u
-    )
+    np.testing.assert_array_equal(found.chains.state.trajectory.u, again.chains.state.trajectory.u)
 
 
 @pytest.mark.parametrize(

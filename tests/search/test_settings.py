@@ -1,11 +1,23 @@
 """Settings by name: what can be set, and what is refused."""
 
 import json
-from dataclasses import replace
+import sys
+import types
+from dataclasses import dataclass, replace
 
 import pytest
 
-from mjx_drax import Constant, DraxError, Geometric, Identity, Langevin, Restarts, Smoothed
+from mjx_drax import (
+    Constant,
+    DraxError,
+    Geometric,
+    Identity,
+    Langevin,
+    Restarts,
+    Rollouts,
+    Smoothed,
+    register_dataclass,
+)
 from mjx_drax.search.settings import changed, from_data, names, to_data
 
 
@@ -15,6 +27,9 @@ from mjx_drax.search.settings import changed, from_data, names, to_data
         ("attempts", "3", 3),
         ("descent", "None", None),
         ("within", "2", 2.0),
+        ("enough", "0.5", 0.5),
+        ("heated", "False", False),
+        ("rollouts", "Rollouts(rounds=4)", Rollouts(rounds=4)),
         ("flow.iterations", "20", 20),
         ("flow.adjusted", "True", True),
         ("flow.noise", "0.5", Constant(0.5)),
@@ -60,6 +75,9 @@ def test_an_end_that_was_final_stays_so():
         ("within", "nan", "give a number"),
         ("descent", "x", "give a whole number or None"),
         ("flow.adjusted", "1", "give True or False"),
+        ("heated", "1", "give True or False or None"),
+        ("enough", "most", "give a number or None"),
+        ("rollouts", "Identity", "rollouts is 'Identity': give one of Rollouts, or MODULE"),
         ("flow.noise", "hot", r"give a number, Geometric\(start, end\)"),
         ("flow.noise.start", "hot", "give a number"),
         ("flow.preconditioner", "Newton", "give one of Diagonal, GaussNewton, Identity, LBFGS"),
@@ -77,5 +95,38 @@ def test_there_and_back(solver):
     assert from_data(json.loads(json.dumps(to_data(solver)))) == solver
 
 
-def test_what_is_not_ours_is_kept_as_text():
-    assert to_data(Langevin(noise=len))["noise"] == repr(len)
+def test_what_is_no_dataclass_is_kept_as_text():
+    data = to_data(Langevin(noise=len))
+    assert data["noise"] == {"text": repr(len)}
+    with pytest.raises(DraxError, match="settings hold <built-in function len>, which was no data"):
+        from_data(data)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Step:
+    """A schedule of a user's own."""
+
+    height: float = 1.0
+
+    def __call__(self, t):
+        """The height until t = 1, then 0."""
+        return self.height * (t < 1.0)
+
+
+def test_classes_of_users_take_part(monkeypatch):
+    here = types.ModuleType("users_own")
+    here.Step = Step
+    monkeypatch.setitem(sys.modules, "users_own", here)
+    monkeypatch.setattr(Step, "__module__", "users_own")
+    solver = changed(Restarts(), "flow.noise", "users_own:Step(height=2.0)")
+    assert solver == replace(Restarts(), flow=replace(Restarts().flow, noise=Step(2.0)))
+    assert changed(solver, "flow.noise.height", "3").flow.noise == Step(3.0)
+    data = json.loads(json.dumps(to_data(solver)))
+    assert data["flow"]["noise"] == {"part": "users_own:Step", "height": 2.0}
+    assert from_data(data) == solver
+    monkeypatch.delitem(sys.modules, "users_own")
+    with pytest.raises(DraxError, match="import users_own before you load them"):
+        from_data(data)
+    with pytest.raises(DraxError, match=r"'users_own:Step' cannot be imported: .*No module named"):
+        changed(Restarts(), "flow.noise", "users_own:Step()")

@@ -14,13 +14,13 @@ from mjx_drax import (
     Geometric,
     Identity,
     Langevin,
+    Rollouts,
     Solution,
     from_function,
     render,
     solve,
 )
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.solution import load as loading
 from mjx_drax.solution import save as results
 from mjx_drax.view.plotting import plot_solution
 
@@ -118,13 +118,13 @@ def test_files_that_are_refused(folder, tmp_path):
         Solution.load(tmp_path / "nowhere")
     rewritten(folder, format=7)
     with pytest.raises(
-        DraxError, match=r"has format 7 .* this version reads format 1: solve again"
+        DraxError, match=r"has format 7 .* this version reads format 2: solve again"
     ):
         Solution.load(folder)
     rewritten(folder, format=None)
     with pytest.raises(DraxError, match="has no format number"):
         Solution.load(folder)
-    rewritten(folder, format=1, settings={"part": "Nonsense"})
+    rewritten(folder, format=2, settings={"part": "Nonsense"})
     with pytest.raises(DraxError, match="Another version of mjx_drax wrote them"):
         Solution.load(folder)
     rewritten(folder, settings=None, certificate={})
@@ -180,7 +180,8 @@ def test_another_version_of_mujoco_compiles_the_mjcf_again(slider, folder, monke
 
 
 def test_other_settings_come_back(slider, tmp_path):
-    solver = Langevin(noise=Geometric(np.float32(3.0), 1e-3), preconditioner=Identity())
+    flow = Langevin(noise=Geometric(np.float32(3.0), 1e-3), preconditioner=Identity())
+    solver = replace(slider.solver, flow=flow, rollouts=Rollouts(rounds=7))
     replace(slider, solver=solver).save(tmp_path)
-    assert loading.load(tmp_path).solver == solver
+    assert Solution.load(tmp_path).solver == solver
     assert mujoco.__version__ in Solution.load(tmp_path).certificate.engine

@@ -252,7 +252,7 @@ def test_result_files_hold_the_optima(hill):
 def test_result_files_and_tables_are_bounded(hill, monkeypatch):
     monkeypatch.setattr(results, "OPTIMA", 3)
     many = replace(hill)
-    many.__dict__["optima"] = distinct(hill, 1e-6)
+    many.__dict__["optima"] = distinct(hill, 1e-8)
     found = len(many.optima)
     assert found > 3
     summary = results.summary(many)
@@ -289,7 +289,7 @@ def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
     with Image.open(plot_optima(hill, tmp_path / "curves.png")) as image:
         assert image.size == (1200, 900)
     many = replace(hill)
-    many.__dict__["optima"] = distinct(hill, 1e-6)
+    many.__dict__["optima"] = distinct(hill, 1e-8)
     seen.clear()
     plot_optima(many, tmp_path / "many.png", draw)
     assert len(seen) == min(len(many.optima), plotting.MAPS)

@@ -254,7 +254,9 @@ def test_ctrl_c_between_reports_keeps_what_there_is():
     solution = solve(reach(), chains=3, solver=QUICK, progress=progress)
     assert seen == [(REPORT_EVERY, 80), (2 * REPORT_EVERY, 80)]
     assert solution.iterations == 2 * REPORT_EVERY
-    np.testing.assert_array_equal(solution.history["iteration"], [0, REPORT_EVERY, 2 * REPORT_EVERY])
+    np.testing.assert_array_equal(
+        solution.history["iteration"], [0, REPORT_EVERY, 2 * REPORT_EVERY]
+    )
     short = solve(reach(), chains=3, solver=QUICK, progress=progress)
     np.testing.assert_array_equal(short.trajectories.x, solution.trajectories.x)
 
