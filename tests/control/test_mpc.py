@@ -25,6 +25,9 @@ from mjx_drax.cli import main
 from mjx_drax.control import mpc
 from mjx_drax.control import trials as loop
 from mjx_drax.control.plant import random_pushes
+from mjx_drax.control.shift import shifted
+from mjx_drax.search.initial import initial_knots
+from mjx_drax.search.iterate import advance, start
 
 DT, K = 0.1, 15
 FAST = Restarts(replace(Restarts().flow, iterations=30, tail=30), descent=40, attempts=1)
@@ -91,21 +94,24 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
     assert np.median(policy.statistics.max_defects) < 1e-4
 
 
-def test_a_shift_by_one_knot_moves_all_that_is_carried(policy):
-    chain = jax.tree.map(lambda a: a[0], policy._carried.state)
-    shift = jax.jit(mpc._shifted)
-    shifted = shift(policy._flow, policy._traced, jnp.float32(1.0), chain)
+def test_a_shift_by_one_knot_moves_all_that_is_carried():
+    problem, flow, key = balance(), FAST.flow, jax.random.key(0)
+    states = start(flow, problem, initial_knots(problem, 1, None, key), key)
+    states, _ = advance(flow, problem, states, 0, 60)
+    chain, shift = jax.tree.map(lambda a: a[0], states), jax.jit(shifted)
+    later = shift(flow, problem, jnp.float32(1.0), chain)
     for now, then in (
-        (shifted.trajectory.x, chain.trajectory.x),
-        (shifted.trajectory.u, chain.trajectory.u),
-        (shifted.multipliers.dynamics, chain.multipliers.dynamics),
-        (shifted.multipliers.bounds[0].u, chain.multipliers.bounds[0].u),
-        (shifted.gains, chain.gains),
+        (later.trajectory.x, chain.trajectory.x),
+        (later.trajectory.u, chain.trajectory.u),
+        (later.multipliers.dynamics, chain.multipliers.dynamics),
+        (later.multipliers.bounds[0].u, chain.multipliers.bounds[0].u),
+        (later.gains, chain.gains),
     ):
+        assert np.abs(then).max() > 0.0
         np.testing.assert_allclose(now[:-1], then[1:], rtol=1e-6)
     last = f(chain.trajectory.x[-1], chain.trajectory.u[-1])
-    np.testing.assert_allclose(shifted.trajectory.x[-1], last, rtol=1e-5)
-    half = shift(policy._flow, policy._traced, jnp.float32(2.5), chain)
+    np.testing.assert_allclose(later.trajectory.x[-1], last, rtol=1e-5)
+    half = shift(flow, problem, jnp.float32(2.5), chain)
     middle = 0.5 * (chain.trajectory.x[2:-1] + chain.trajectory.x[3:])
     np.testing.assert_allclose(half.trajectory.x[: K - 3], middle, atol=1e-6)
 
