@@ -26,7 +26,8 @@ def test_the_reference_has_every_public_name(tmp_path):
     written = runpy.run_path(str(ROOT / "docs" / "make_reference.py"))["write"](tmp_path)
     page = written.read_text(encoding="utf-8")
     for name in mjx_drax.__all__:
-        assert f'id="{name}"' in page
+        if not inspect.ismodule(getattr(mjx_drax, name)):  # these have pages of their own
+            assert f'id="{name}"' in page
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
