@@ -26,7 +26,7 @@ from mjx_drax import (
 from mjx_drax.base import digests
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.search import checkpoint, engine
+from mjx_drax.search import checkpoint, engine, recording
 from mjx_drax.search.iterate import iterate
 from mjx_drax.search.restarts import Rollouts
 
@@ -163,9 +163,11 @@ def test_a_batch_that_is_killed_goes_on_to_the_same_answer(whole_batch, tmp_path
 
 
 @pytest.mark.usefixtures("often")
-def test_a_recording_goes_on_too(tmp_path):
+@pytest.mark.parametrize(("limit", "stops"), [(recording.LIMIT, (1, 10, 20)), (6000, (1, 5, 12))])
+def test_a_recording_goes_on_too(limit, stops, tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "LIMIT", limit)  # if it is full, fewer snapshots are taken
     whole, file = solved(record=3), tmp_path / "run.ckpt"
-    for count in (1, 10, 20):
+    for count in stops:
         with pytest.raises(Killed):
             solved(record=3, checkpoint=file, progress=killed_after(count))
     assert_same(solved(record=3, checkpoint=file), whole)

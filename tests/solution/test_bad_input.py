@@ -17,7 +17,7 @@ from builders import INF, NAN, At, arm, assert_complains, cases, cut_short, made
 
 from mjx_drax import Solution, from_program, minimize, save_csv, save_dataset, solve, solve_batch
 from mjx_drax.solution.formats import export_keyframes
-from mjx_drax.solution.optima import distinct
+from mjx_drax.solution.results import distinct
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")
 
