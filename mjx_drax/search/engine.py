@@ -344,7 +344,7 @@ class Search:
             key_knots, key_noise = jax.random.split(key)
             knots = initial_knots(self.family.problem, self.chains, self.guess, key_knots)
             return knots, chain_keys(key_noise, self.chains)
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(indices))
+        keys = _keys_of(key, indices)
         guess = self.family.problem.guess
         shared, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
         return _drawn_by_row(own.problem, shared.problem, keys, self.chains, guess)
@@ -398,10 +398,11 @@ class Search:
                 stage, now = self.stage, self.stage.now
                 stop = min(stage.step + self._report_every(total), total)
                 state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
-                died_at = np.asarray(gathered(state.died_at, self.mesh))
-                if stage.attempt == stage.place == stage.step == 0 and (died_at == 0).all():
-                    knots = gathered(now.state.trajectory, self.mesh)
-                    require_sound(flow, self.family.at(0), knots)
+                if stage.attempt == stage.place == stage.step == 0:
+                    died_at = np.asarray(gathered(state.died_at, self.mesh))
+                    if (died_at == 0).all():
+                        knots = gathered(now.state.trajectory, self.mesh)
+                        require_sound(flow, self.family.at(0), knots)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 now = Chains(state, info, np.where(feasible, since, -1))
@@ -412,6 +413,8 @@ class Search:
 
     def _report_every(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""
+        if not self.family.alone:  # nobody is told before a chunk is done
+            return total
         usual = max(REPORT_EVERY, total // 100)
         return usual if self.recorder is None else min(usual, self.recorder.every)
 
@@ -596,9 +599,16 @@ def _drawn_by_row(
     return rows
 
 
+@partial(jax.jit, static_argnums=1)
 def chain_keys(key: Array, chains: int) -> Array:
     """The key of each chain, so that results do not depend on how chains are split over calls."""
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
+
+
+@jax.jit
+def _keys_of(key: Array, indices: Array) -> Array:
+    """The key of each problem, whatever is solved beside it."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
 
 
 def _slim(chains: Chains) -> Chains:
