@@ -52,9 +52,17 @@ from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.cost import Cost
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.trajectory import Trajectory
-from mjx_drax.search.engine import Chains, Search, chain_keys
+from mjx_drax.search.engine import Chains, Search
 from mjx_drax.search.family import Family
-from mjx_drax.search.iterate import FEASIBLE, Question, evaluate, loop, partition, ranking
+from mjx_drax.search.iterate import (
+    FEASIBLE,
+    Question,
+    chain_keys,
+    evaluate,
+    loop,
+    partition,
+    ranking,
+)
 from mjx_drax.search.restarts import Restarts, settled
 
 CHEAPER = 0.9

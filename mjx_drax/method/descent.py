@@ -112,31 +112,18 @@ def metropolis(
     return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
 
 
-def adapted_damping(damping: Array, size: ArrayLike) -> Array:
-    """A chain's factor on the damping after a step of relative size alpha."""
-    short = jnp.where(jnp.asarray(size) < SHORT_STEP, MORE_DAMPING, 1.0)
-    factor = jnp.where(jnp.asarray(size) >= 1.0, LESS_DAMPING, short)
-    return jnp.clip(factor * damping, *DAMPING_RANGE)
-
-
 def adapted(
-    problem: Problem,
-    bounds: Bounds,
-    old: Any,
-    new: Any,
-    size: Array,
-    weights: Weights,
-    noisy: ArrayLike,
+    problem: Problem, bounds: Bounds, old: Any, new: Any, alpha: Array, weights: Weights
 ) -> Any:
-    """A chain's new State with the damping and bounds' multipliers that an iteration leaves.
+    """The State with the damping and bounds' multipliers that a step of size alpha leaves.
 
-    The multipliers of bounds take Newton's step in the tail, and are central while noise is on.
+    The multipliers of bounds take Newton's step.
     """
-    box, knots, v = problem.bounds, (old.trajectory, new.trajectory), old.multipliers.bounds
-    followed = bounds.follow(box, *knots, v, weights.barrier, size)
-    central = bounds.multipliers(box, new.trajectory, weights.barrier)
-    v = jax.tree.map(lambda a, b: jnp.where(noisy, a, b), central, followed)
-    damping = jnp.where(noisy, old.damping, adapted_damping(old.damping, size))
+    knots, v = (old.trajectory, new.trajectory), old.multipliers.bounds
+    v = bounds.follow(problem.bounds, *knots, v, weights.barrier, alpha)
+    short = jnp.where(alpha < SHORT_STEP, MORE_DAMPING, 1.0)
+    factor = jnp.where(alpha >= 1.0, LESS_DAMPING, short)
+    damping = jnp.clip(factor * old.damping, *DAMPING_RANGE)
     return replace(new, multipliers=replace(new.multipliers, bounds=v), damping=damping)
 
 

@@ -150,13 +150,10 @@ class Langevin:
             problem: the problem.
             state: the chain.
             iteration: from 0; the schedules are read there, traced.
-            tail, noise: False leaves out the noise-free tail, or the iterations with noise, which
-                are then never reached (static). A GPU waits for the choice between the two.
-            moves: where this traced truth value is False, the chain stands still and is diagnosed;
-                given so, both take one copy of f in a compiled program.
+            tail, noise: False leaves out iterations of that kind, which must not come (static).
+            moves: where this is False (traced), the chain stands still and is diagnosed.
 
-        Returns:
-            the state, and diagnostics from the line search; zeros from steps with noise.
+        Diagnostics come from the line search; they are zeros from steps with noise.
         """
         iteration = jnp.asarray(iteration)
         noisy = iteration < self.iterations if noise else False
@@ -166,36 +163,39 @@ class Langevin:
         compute = (lambda f: f()) if moves is None else partial(where_needed, moves)
         model = compute(partial(self._model, problem, state, weights, key, tail))
 
-        def diffuse() -> tuple[Any, ...]:
+        def diffuse() -> tuple[State, Info]:
             to = metric.direction(problem, model, key, state.memory)
-            X, zero = self._diffused(problem, state, to, weights, key, tail), jnp.zeros(())
-            alpha, info = jnp.asarray(self.step_size, zero.dtype), Info(zero, zero, zero)
-            return X, alpha, info, to.multipliers, to.gains, to.memory
+            X = self._diffused(problem, state, to, weights, key, tail)
+            new = self._moved(state, X, jnp.asarray(self.step_size), to)
+            if tail:  # where bounds have multipliers of their own, which start on the central path
+                v = self.bounds.multipliers(problem.bounds, X, weights.barrier)
+                new = replace(new, multipliers=replace(new.multipliers, bounds=v))
+            zero = jnp.zeros(())
+            return _keep_finite(state, new, iteration, moves), Info(zero, zero, zero)
 
-        def descend() -> tuple[Any, ...]:
+        def descend() -> tuple[State, Info]:
             to = compute(lambda: metric.direction(problem, model, None, state.memory))
             at = problem, self.bounds, state.trajectory, state.multipliers, weights
-            chosen = descent.line_search(*at, to.drift, metric.ladder)
-            return *chosen, to.multipliers, to.gains, to.memory
+            X, alpha, info = descent.line_search(*at, to.drift, metric.ladder)
+            new = self._moved(state, X, alpha, to)
+            new = descent.adapted(problem, self.bounds, state, new, alpha, weights)
+            return _keep_finite(state, new, iteration, moves), info
 
-        chosen = diffuse if noise else descend
-        found = jax.lax.cond(noisy, diffuse, descend) if tail and noise else chosen()
-        X, size, info, rate, gains, memory = found
-        alpha = jnp.ones_like(size) if metric.full_multiplier_steps else size
-        lambda_ = jax.tree.map(
-            lambda m, r: m + alpha * r, replace(state.multipliers, bounds=None), rate
-        )
-        v = state.multipliers.bounds
-        new = replace(
+        one: Any = diffuse if noise else descend
+        return jax.lax.cond(noisy, diffuse, descend) if tail and noise else one()
+
+    def _moved(self, state: State, X: Trajectory, alpha: Array, to: Direction) -> State:
+        """The chain at X, with lambda + alpha r."""
+        size = jnp.ones_like(alpha) if self.preconditioner.full_multiplier_steps else alpha
+        before = replace(state.multipliers, bounds=None)
+        lambda_ = jax.tree.map(lambda m, r: m + size * r, before, to.multipliers)
+        return replace(
             state,
             trajectory=X,
-            multipliers=replace(lambda_, bounds=v),
-            gains=gains,
-            memory=memory,
+            multipliers=replace(lambda_, bounds=state.multipliers.bounds),
+            gains=to.gains,
+            memory=to.memory,
         )
-        if tail:
-            new = descent.adapted(problem, self.bounds, state, new, size, weights, noisy)
-        return _keep_finite(state, new, iteration, moves), info
 
     def progress(self, iteration: ArrayLike, noisy: ArrayLike) -> Array:
         """t: from 0 to 1 over the iterations with noise, from 1 to 2 over the tail."""

@@ -38,6 +38,7 @@ from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
     begin,
+    chain_keys,
     iterate,
     joined,
     noise_at,
@@ -235,12 +236,12 @@ class Search:
         saved = self.checkpoint is not None and self.checkpoint.found is not None
         one = family.at(0)
         if not saved:
-            mine = jax.tree.map(lambda a: a[: self.chains], knots)
+            mine = knots if family.alone else jax.tree.map(lambda a: a[: self.chains], knots)
             flow = self.settings.first(1.0)
             require_sound(flow, one, mine, with_f=not family.problem.dynamics.checked)
         self._settle(0, indices, scale)
         state = begin(self.question[1], self.question[0], knots, keys)
-        zeros = jnp.zeros(rows)
+        zeros: Any = np.zeros(rows, knots.u.dtype)
         info = Info(zeros, zeros, zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
             _, info = jax.block_until_ready(self._iterated(state, 0, 0))
@@ -338,12 +339,12 @@ class Search:
         return replace(chains, state=gathered(chains.state, self.mesh))
 
     def _drawn(self, attempt: int, indices: np.ndarray) -> tuple[Trajectory, Array]:
-        """Initial knots (rows, K, ...) and random keys (rows,) of an attempt on some problems."""
+        """Initial knots (rows, K, ...) and random keys of an attempt on some problems."""
         key = jax.random.fold_in(jax.random.key(self.seed), attempt)
         if self.family.alone:
             key_knots, key_noise = jax.random.split(key)
             knots = initial_knots(self.family.problem, self.chains, self.guess, key_knots)
-            return knots, chain_keys(key_noise, self.chains)
+            return knots, key_noise
         keys = _keys_of(key, indices)
         guess = self.family.problem.guess
         shared, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
@@ -518,7 +519,7 @@ class Search:
 
         def state() -> State:
             x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))
-            return begin(own, shared, Trajectory(x, u), chain_keys(jax.random.key(0), rows))
+            return begin(own, shared, Trajectory(x, u), jax.random.key(0))
 
         def size(tree: Any) -> int:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
@@ -597,12 +598,6 @@ def _drawn_by_row(
     both = jax.vmap(of_problem)(own, keys)
     rows: tuple[Trajectory, Array] = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), both)
     return rows
-
-
-@partial(jax.jit, static_argnums=1)
-def chain_keys(key: Array, chains: int) -> Array:
-    """The key of each chain, so that results do not depend on how chains are split over calls."""
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
 
 
 @jax.jit

@@ -72,8 +72,19 @@ def _by_row(shared: Question, own: Question, function: Callable[..., Any], *rows
 
 @jax.jit
 def begin(own: Question, shared: Question, knots: Trajectory, keys: Array) -> State:
-    """The first state of chains that start at the given knots (rows, K, ...), keys (rows,)."""
+    """The first state of chains that start at the given knots (rows, K, ...).
+
+    Keys are one for each row, (rows,), or one for all, of which row i folds in i: results do not
+    depend on how chains are split over calls.
+    """
+    if keys.ndim == 0:
+        keys = chain_keys(keys, len(knots.u))
     return _by_row(shared, own, lambda q, *given: q.flow.init(q.problem, *given), knots, keys)
+
+
+def chain_keys(key: Array, chains: int) -> Array:
+    """The key of each chain, (chains,)."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(chains))
 
 
 @jax.jit
@@ -191,9 +202,8 @@ def noise_at(flow: Langevin, iteration: int) -> float:
 
 def start(flow: Langevin, problem: Problem, knots: Trajectory, key: Array) -> State:
     """Chains of one problem at knots (chains, K, ...); chain c has the key fold_in(key, c)."""
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(len(knots.u)))
     shared, own = partition(Question(flow, problem), None)
-    return begin(own, shared, knots, keys)
+    return begin(own, shared, knots, key)
 
 
 def advance(
