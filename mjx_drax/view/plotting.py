@@ -32,7 +32,7 @@ from mjx_drax.view.labels import control_labels, state_groups
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mjx_drax.solution.optima import Optimum
+    from mjx_drax.solution.results import Optimum
     from mjx_drax.view.drawing import Draw
 
     Panel = Callable[[Axes], None]
