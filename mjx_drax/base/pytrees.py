@@ -46,11 +46,11 @@ def register_dataclass(cls: Class) -> Class:
         return [getattr(node, name) for name in traced], tuple(getattr(node, n) for n in static)
 
     def flatten_with_keys(node: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-        leaves, aside = flatten(node)
-        return list(zip(keys, leaves, strict=True)), aside
+        leaves, static_values = flatten(node)
+        return list(zip(keys, leaves, strict=True)), static_values
 
-    def unflatten(aside: tuple[Any, ...], leaves: Iterable[Any]) -> Any:
-        return cls(**dict(zip(names, (*leaves, *aside), strict=True)))
+    def unflatten(static_values: tuple[Any, ...], leaves: Iterable[Any]) -> Any:
+        return cls(**dict(zip(names, (*leaves, *static_values), strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     REGISTERED.append(cls)

@@ -24,7 +24,7 @@ class Bar:
         return self
 
     def __call__(self, done: int, total: int, info: Info) -> None:
-        """Show where the solve stands."""
+        """Show how far the solve is."""
         import numpy as np
         from tqdm import tqdm
 

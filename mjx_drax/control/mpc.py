@@ -329,8 +329,8 @@ class MPC:
 
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
         """Plan in one launch, and use it if it is finite."""
-        level = 1.0 if self._plan is None else float(abs(self._plan.cost))
-        scale = Scale(self._heated.scale.cost, np.float32(np.sqrt(max(level, 1e-12))))
+        cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
+        scale = Scale(self._heated.scale.cost, np.float32(np.sqrt(max(cost, 1e-12))))
         self._time = t  # of what is carried; the plan in use is older after one that failed
         self._carried, device = _plan(
             self._flow,

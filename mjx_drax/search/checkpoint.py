@@ -1,4 +1,4 @@
-"""Where a solve stands, in a file that it goes on from after it was killed.
+"""How far a solve is, in a file that it goes on from after it was killed.
 
 The file is written every `EVERY` seconds of a solve and at its end, each time at once or not at
 all. A solve that finds it goes on from there, and its answer is bit for bit that of a solve which
@@ -120,7 +120,7 @@ class Checkpoint:
     def save(self, tree: Callable[[], Any], now: bool = False) -> None:
         """Write the tree that `tree()` gives if it is time to, or `now`.
 
-        A checkpoint that cannot be written is not worth a solve: it warns once, and goes on.
+        A checkpoint that cannot be written does not end a solve: it warns once, and goes on.
         """
         clock = time.monotonic()
         if not now and clock < self._due:

@@ -1,4 +1,4 @@
-"""What stands at the door of a solve: whether settings and functions can work.
+"""What is asked before a solve: whether settings and functions can work.
 
 Settings are looked at; functions are traced, and tried at the initial knots, with derivatives.
 """

@@ -1,6 +1,6 @@
 """The compiled loops over iterations: many chains at once, of one problem or of many.
 
-Chains are rows. What all rows share (settings, functions, most numbers of a problem) stands once;
+Chains are rows. What all rows share (settings, functions, most numbers of a problem) is there once;
 what differs from row to row has a leading axis. `Question` holds both, and `partition` parts them.
 """
 
@@ -37,7 +37,7 @@ class Question(NamedTuple):
 
     flow: Langevin
     problem: Problem
-    offset: Any = np.int32(0)
+    offset: ArrayLike = np.int32(0)
 
 
 def partition(question: Question, differs: tuple[bool, ...] | None) -> tuple[Question, Question]:

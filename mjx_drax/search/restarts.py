@@ -152,7 +152,7 @@ class Restarts:
 
 
 def as_restarts(solver: Langevin | Restarts | None) -> Restarts:
-    """The solver, of which a `Langevin` is one attempt with its schedules as they stand.
+    """The solver, of which a `Langevin` is one attempt with its schedules in their own scale.
 
     Raises:
         DraxError: it is neither.

@@ -85,21 +85,21 @@ def judged(
     problem: Problem,
     plan: np.ndarray,
     ran: tuple[np.ndarray, np.ndarray],
-    worth_of: Callable[[Trajectory], tuple[Array, Array]],
+    cost_and_violation: Callable[[Trajectory], tuple[Array, Array]],
 ) -> Replays:
-    """What replays are worth.
+    """Replays with their costs, bound violations and successes.
 
     Args:
         problem: for its goal, its state arithmetic and its precision.
         plan: planned states x_0..x_K, (runs, K + 1, nx).
         ran: replayed states, of the same shape, and the controls that were applied (runs, K, nu).
-        worth_of: gives cost and bound violation of a batch of trajectories.
+        cost_and_violation: gives cost and bound violation of a batch of trajectories.
     """
     states, controls = ran
     off = np.nan_to_num(problem.dynamics.deviation(states, plan), nan=np.inf)
     dtype = problem.x_init.dtype
     knots = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
-    cost, outside = worth_of(knots)
+    cost, outside = cost_and_violation(knots)
     ends = zip(states[:, -1], off[:, -1], strict=True)
     reached = [_reached(problem, x, deviation) for x, deviation in ends]
     violation = np.nan_to_num(np.asarray(outside), nan=np.inf)

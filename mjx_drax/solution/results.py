@@ -1,4 +1,4 @@
-"""What came of a solve: all chains, how they replay, and what the best of them is worth.
+"""What came of a solve: all chains, how they replay, and the distinct optima.
 
 A cost alone says nothing, because an infeasible trajectory undercuts the optimum. So every chain's
 controls are replayed from x_init; see `replay`.

@@ -42,7 +42,7 @@ def solve(
         chains: number of chains.
         seed: of all random numbers.
         solver: `Restarts()` by default, whose settings are scaled from the problem; or one
-            `Langevin` with its schedules as they stand.
+            `Langevin` with its schedules in their own scale.
         guess: initial knots instead of random ones: one trajectory for all chains, (K, nx) and
             (K, nu), or one each, (chains, K, nx) and (chains, K, nu). They need not be feasible.
         progress: called with (iterations done, of how many, diagnostics) every few iterations;

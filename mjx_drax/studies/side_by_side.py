@@ -97,8 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         old, new = ([r for r in found[w] if r["task"] == task] for w in ("old", "new"))
 
         def median(rows: list[dict[str, Any]], name: str) -> float:
-            values = [r[name] if name == "compile" else np.median(r[name][1:]) for r in rows]
-            return float(np.median(values))
+            values = [r[name] if name == "compile" else r[name][1:] or r[name] for r in rows]
+            return float(np.median([np.median(value) for value in values]))
 
         ratios = {n: median(new, n) / median(old, n) for n in ("compile", "solves")}
         print(f"{task:26} new / old: compile {ratios['compile']:.3f}, solve {ratios['solves']:.3f}")

@@ -105,7 +105,7 @@ def _draw_paths(axes: Axes, solution: Solution) -> None:
 
 
 def _outcome(row: Numbers) -> str:
-    """What stands above a panel."""
+    """The title of a panel."""
     best = "" if row["best cost"] is None else f", cost {row['best cost']:.4g}"
     return (
         f"{row['iterations']:,} iterations: {row['reaches goal']:.0%} escape{best}\n"
