@@ -3,6 +3,7 @@
 Environment variables, so that the programs which the tests start have the same settings.
 """
 
+import gc
 import importlib.util
 import os
 import sys
@@ -25,6 +26,8 @@ _quick = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "0" if _slow el
 if _quick and version("jaxlib").startswith("0.10."):  # later ones end at a flag they do not know
     _flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
+
+gc.set_threshold(100_000, 20, 100)  # a twentieth of the time went into looking for garbage
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

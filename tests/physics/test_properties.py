@@ -14,7 +14,7 @@ from mjx_drax.physics.source import load
 NUMBERS = ("x_init", "horizon", "dt", "x_bounds", "u_bounds", "x_scatter", "u_scatter")
 
 
-@bounded
+@settings(bounded, max_examples=25)
 @given(name=st.sampled_from([*NUMBERS, "contacts", "goal"]), value=anything)
 def test_any_argument_makes_a_robot_or_a_complaint(name, value):
     outcome(lambda: robot(**{name: value}))

@@ -33,6 +33,8 @@ from mjx_drax.search import devices
 count = int(sys.argv[2])
 assert len(jax.devices()) == count
 solver = Restarts(replace(Restarts().flow, iterations=20, tail=10), descent=10, attempts=2)
+if sys.argv[3] == "solve":
+    solver = solver.flow  # half the programs
 alone, spread = (solve(problem, 8, 0, solver, devices=n) for n in (1, count))
 
 def same(one, other):

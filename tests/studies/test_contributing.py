@@ -300,7 +300,9 @@ def off(a, b):
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
-@pytest.fixture(scope="module", params=["Pendulum", "OnCircle"])
+@pytest.fixture(
+    scope="module", params=[pytest.param("Pendulum", marks=pytest.mark.slow), "OnCircle"]
+)
 def swung(mine, request):
     """A solution with dynamics of a user's own."""
     problem = problem_of(getattr(mine, request.param)())

@@ -62,6 +62,7 @@ def test_phase_portrait_is_written_and_its_numbers_are_measured(tmp_path, capsys
     assert numbers["jax"] == jax.__version__
 
 
+@pytest.mark.slow
 def test_convergence_has_a_curve_for_every_penalty():
     numbers, figure = convergence.make(chains=4, iterations=400, penalties=(0.01, 10.0))
     weak, strong = numbers["rows"]
