@@ -1,6 +1,7 @@
 """Descending first, heating what failed: nothing found is lost, and no setting depends on units."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -202,24 +203,32 @@ def test_rollouts_follow_where_f_has_kinks(balls):
         assert path.iteration[-1] == kinked.iterations
 
 
-def test_rollouts_follow_in_a_batch_too(balls):
+def two_balls(ball, rollouts=None, **changes):
+    """A batch of the ball from two starts."""
+    solver = Restarts(attempts=1, rollouts=rollouts)
     starts = np.array([[1.0, 0.0], [0.8, 0.5]], np.float32)
+    make = partial(with_start, ball)
+    return starts, solve_batch(make, starts, chains=8, solver=solver, **changes)
 
-    def solved(rollouts=None, **changes):
-        solver = Restarts(attempts=1, rollouts=rollouts)
-        return solve_batch(from_start, starts, chains=8, solver=solver, **changes)
 
-    def from_start(x):
-        return replace(balls[1], x_init=x)
+def with_start(ball, x):
+    return replace(ball, x_init=x)
 
-    without, found = solved(NO_ROLLOUTS), solved()
+
+def test_rollouts_follow_in_a_batch_too(balls):
+    (_, without), (starts, found) = two_balls(balls[1], NO_ROLLOUTS), two_balls(balls[1])
     assert not (without.chain_defect < 1e-3).any()
     assert (found.chain_defect < 1e-3).mean() > 0.9
     assert found.feasible.all()
     np.testing.assert_array_equal(found.x[:, 0], starts)
     assert without.open_loop.max_deviation.min() > 1.0
     assert found.open_loop.max_deviation.max() < 0.02
-    split = solved(chunk=1)  # each problem has its own rollouts
+
+
+@pytest.mark.slow
+def test_each_problem_of_a_batch_has_its_own_rollouts(balls):
+    """Bit for bit as users compile, which the slow tests do."""
+    (_, found), (_, split) = two_balls(balls[1]), two_balls(balls[1], chunk=1)
     np.testing.assert_array_equal(split.u, found.u)
     np.testing.assert_array_equal(split.chain_cost, found.chain_cost)
 
