@@ -22,7 +22,7 @@ and S are at hand. Newton step and noise are hence two solutions of one affine r
 
     dx_{k+1} = F_k dx_k + f_k,     F = mu S^{-1} (A + B K)
 
-that is solved in parallel over time. Shapes: all arrays carry the stage axis K first.
+that GPUs solve in parallel over time. Shapes: all arrays carry the stage axis K first.
 
 With thousands of chains on a GPU one kernel does the same, stage by stage (`kernels.riccati_gpu`).
 """
@@ -37,6 +37,7 @@ from jax import Array
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels.linalg import cholesky, solve, solve_upper, symmetric
+from mjx_drax.kernels.recursion import affine_recursion
 from mjx_drax.kernels.riccati_gpu import vmapped_as_kernel
 from mjx_drax.method.model import Linearization, QuadraticCost
 
@@ -141,11 +142,8 @@ def solve_and_sample(
         f_noise = out[:, -1] - solve_upper(factors.Ls, white.e)
         return out[:, :-2], jnp.column_stack([out[:, -2], f_noise])
 
-    def compose(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-        return second[0] @ first[0], second[0] @ first[1] + second[1]
-
-    F_and_f = jax.vmap(affine)(model, factors, multipliers, white)
-    after = jax.lax.associative_scan(compose, F_and_f)[1]  # dx_1..dx_K since dx_0 = 0
+    F, f = jax.vmap(affine)(model, factors, multipliers, white)
+    after = affine_recursion(F, f)  # dx_1..dx_K since dx_0 = 0
     before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])
     controls = factors.K @ before
     dx, du = after[..., 0], controls[..., 0] + factors.kff
