@@ -144,7 +144,7 @@ class Langevin:
         noise: bool = True,
         moves: Array | None = None,
     ) -> tuple[State, Info]:
-        """One iteration, and diagnostics of where it ends.
+        """One iteration, and diagnostics of where it ends; zeros from steps with noise.
 
         Args:
             problem: the problem.
@@ -152,8 +152,6 @@ class Langevin:
             iteration: from 0; the schedules are read there, traced.
             tail, noise: False leaves out iterations of that kind, which must not come (static).
             moves: where this is False (traced), the chain stands still and is diagnosed.
-
-        Diagnostics come from the line search; they are zeros from steps with noise.
         """
         iteration = jnp.asarray(iteration)
         noisy = iteration < self.iterations if noise else False
@@ -167,11 +165,11 @@ class Langevin:
             to = metric.direction(problem, model, key, state.memory)
             X = self._diffused(problem, state, to, weights, key, tail)
             new = self._moved(state, X, jnp.asarray(self.step_size), to)
-            if tail:  # where bounds have multipliers of their own, which start on the central path
+            if tail:  # for which bounds have multipliers of their own, central at first
                 v = self.bounds.multipliers(problem.bounds, X, weights.barrier)
                 new = replace(new, multipliers=replace(new.multipliers, bounds=v))
             zero = jnp.zeros(())
-            return _keep_finite(state, new, iteration, moves), Info(zero, zero, zero)
+            return new, Info(zero, zero, zero)
 
         def descend() -> tuple[State, Info]:
             to = compute(lambda: metric.direction(problem, model, None, state.memory))
@@ -179,10 +177,11 @@ class Langevin:
             X, alpha, info = descent.line_search(*at, to.drift, metric.ladder)
             new = self._moved(state, X, alpha, to)
             new = descent.adapted(problem, self.bounds, state, new, alpha, weights)
-            return _keep_finite(state, new, iteration, moves), info
+            return new, info
 
-        one: Any = diffuse if noise else descend
-        return jax.lax.cond(noisy, diffuse, descend) if tail and noise else one()
+        one = diffuse if noise else descend
+        new, info = jax.lax.cond(noisy, diffuse, descend) if tail and noise else one()
+        return _keep_finite(state, new, iteration, moves), info
 
     def _moved(self, state: State, X: Trajectory, alpha: Array, to: Direction) -> State:
         """The chain at X, with lambda + alpha r."""

@@ -62,8 +62,8 @@ def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeyp
         calls.append(len(arrays[0]))
         return newton_steps(*arrays, interpret=True)
 
-    def as_on_gpus(*arguments, cuda, default):
-        return cuda(*arguments)
+    def as_on_gpus(*arguments, default, **own):
+        return own.get("cuda", default)(*arguments)
 
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(riccati_gpu, "newton_steps", interpreted)
