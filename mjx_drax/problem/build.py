@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole, shown
 from mjx_drax.base.numbers import vector
-from mjx_drax.problem.cost import Constraint, as_partial, constraint_of, cost_of
+from mjx_drax.problem.cost import as_partial, constraint_of, cost_of
 from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import require_functions
@@ -41,22 +41,6 @@ def knots(horizon: float, dt: float) -> int:
             f"than {MOST:,} steps."
         )
     return round(share)
-
-
-def constraints_of(
-    dynamics: Dynamics,
-    equality: Callable[..., Any] | None,
-    inequality: Callable[..., Any] | None,
-    terminal_equality: Callable[..., Any] | None,
-    terminal_inequality: Callable[..., Any] | None,
-) -> tuple[Constraint, Constraint]:
-    """The constraints of the stages and of the end."""
-    x, u = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu)
-    seen = jax.eval_shape(dynamics.observe, x, u)
-    return (
-        constraint_of(equality, inequality, (seen, u)),
-        constraint_of(terminal_equality, terminal_inequality, (seen,), "terminal_"),
-    )
 
 
 def from_function(
@@ -194,20 +178,17 @@ def assembled(
         near: share of chains that start nearer to x_init.
         host: goal, guess and name.
     """
-    constraint, terminal_constraint = constraints_of(
-        dynamics,
-        given["equality"],
-        given["inequality"],
-        given["terminal_equality"],
-        given["terminal_inequality"],
-    )
+    x, u = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu)
+    seen = jax.eval_shape(dynamics.observe, x, u)
+    stage = given["equality"], given["inequality"]
+    end = given["terminal_equality"], given["terminal_inequality"]
     return checked(
         Problem(
             dynamics=dynamics,
             running=cost_of(given["running_cost"], given["running_residual"]),
             terminal=cost_of(given["terminal_cost"], given["terminal_residual"]),
-            constraint=constraint,
-            terminal_constraint=terminal_constraint,
+            constraint=constraint_of(*stage, (seen, u)),
+            terminal_constraint=constraint_of(*end, (seen,), "terminal_"),
             x_init=x_init,
             bounds=bounds,
             scatter=scatter,
