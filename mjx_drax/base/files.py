@@ -11,6 +11,7 @@ import importlib.util
 import json
 import math
 import os
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def complete(path: str | os.PathLike[str], suffixes: tuple[str, ...] = ()) -> It
         raise DraxError(f"{target.name!r} does not end in {' or '.join(suffixes)}: rename it.")
     if target.is_dir():
         raise DraxError(f"cannot write {str(target)!r}: it is a folder; give a file in it.")
-    partial = target.with_name(_partial(target, str(os.getpid())))
+    partial = target.with_name(_partial(target, _process(os.getpid())))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield partial
@@ -98,6 +99,35 @@ def _partial(target: Path, process: str) -> str:
     return f".{target.stem}.{process}.partial{target.suffix}"
 
 
+def _process(number: int | str) -> str:
+    """A process among those of all machines that may share a folder."""
+    return f"{socket.gethostname()}-{number}"
+
+
+def _remove_left_over(target: Path) -> None:
+    """Remove what dead processes of this machine left of a file.
+
+    Of processes on other machines nobody here can tell whether they are still at work.
+    """
+    start, end = _partial(target, _process("\0")).split("\0")
+    for left in target.parent.glob(f"{glob.escape(start)}*{glob.escape(end)}"):
+        number = left.name[len(start) : len(left.name) - len(end)]
+        if number.isdecimal() and not _lives(int(number)):
+            with contextlib.suppress(OSError):
+                left.unlink()
+
+
+def _lives(number: int) -> bool:
+    """Whether a process of that number runs on this machine; a doubt counts as yes."""
+    try:
+        os.kill(number, 0)  # signal 0 is not sent: the call only looks for the process
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # it is another user's, or no number of a process
+        return True
+    return True
+
+
 class _Tried(Exception):
     """A file was tried and is not to be kept."""
 
@@ -105,15 +135,14 @@ class _Tried(Exception):
 def require_room(path: str | os.PathLike[str], size: int = 1) -> None:
     """Complain about a file that could not be written; call it before a long computation.
 
-    It is tried, with `size` bytes, and removed. So is what killed processes left of it.
+    It is tried, with `size` bytes, and removed. So is what killed processes left of it, while the
+    files of processes that are still at work stay.
 
     Raises:
         DraxError: the folder cannot be made or written to, or the disk is too full.
     """
     target = Path(path).expanduser()
-    for left in target.parent.glob(_partial(Path(glob.escape(target.name)), "*")):
-        with contextlib.suppress(OSError):
-            left.unlink()
+    _remove_left_over(target)
     with contextlib.suppress(_Tried), complete(target) as partial:
         with open(partial, "wb") as file:
             os.posix_fallocate(file.fileno(), 0, size)

@@ -286,7 +286,8 @@ def _model(summary: dict[str, Any], arrays: Arrays) -> tuple[mujoco.MjModel, Sou
     """The compiled model, from its MJCF if another version of MuJoCo compiled it, and its MJCF."""
     source, written = None, summary["versions"]["mujoco"]
     if "model.xml" in arrays:
-        files = {k: v.tobytes() for k, v in _within("model.files/", arrays).items()}
+        named = _within("model.files/", arrays)
+        files = {_file_name(name): content.tobytes() for name, content in named.items()}
         source = Source(str(arrays["model.xml"]), files)
     if written == mujoco.__version__:
         return from_binary(arrays["model.binary"].tobytes()), source
@@ -303,6 +304,21 @@ def _model(summary: dict[str, Any], arrays: Arrays) -> tuple[mujoco.MjModel, Sou
         stacklevel=4,
     )
     return source.compiled(), source
+
+
+def _file_name(name: str) -> str:
+    """The name of a model's file, if it names a file in whatever folder it is written to.
+
+    Raises:
+        DraxError: it leads to another folder, as an archive that someone has tampered with may.
+    """
+    drive = len(name) > 1 and name[0].isalpha() and name[1] == ":"
+    if drive or name in ("", ".", "..") or any(mark in name for mark in "/\\\0"):
+        raise DraxError(
+            f"{ARRAYS} names a file of the model {shown(name)}, which may lie in another folder: "
+            "use results from where you trust, or solve again."
+        )
+    return name
 
 
 def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> None:

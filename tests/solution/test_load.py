@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import fields, replace
+from hashlib import sha256
 
 import jax
 import mujoco
@@ -135,6 +136,18 @@ def test_files_that_are_refused(folder, tmp_path):
         Solution.load(folder)
     (folder / "result.json").write_text("[1]")
     with pytest.raises(DraxError, match="is damaged, it is no JSON object"):
+        Solution.load(folder)
+
+
+@pytest.mark.parametrize(
+    "name", ["../../../x.sh", "/x.sh", "a/b.stl", "..", "", "..\\x.sh", "C:x.sh"]
+)
+def test_files_of_a_model_that_lead_elsewhere_are_refused(folder, name):
+    arrays = dict(np.load(folder / "result.npz"))
+    arrays[f"model.files/{name}"] = np.frombuffer(b"#!", np.uint8)
+    np.savez(folder / "result.npz", **arrays)
+    rewritten(folder, npz_sha256=sha256((folder / "result.npz").read_bytes()).hexdigest())
+    with pytest.raises(DraxError, match="may lie in another folder: use results from where"):
         Solution.load(folder)
 
 
