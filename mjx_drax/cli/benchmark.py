@@ -3,13 +3,15 @@
 Tasks are solved for several seeds. A table is printed; benchmark.json (a list of rows) and
 benchmark.png (success against time) are written. The suites:
 
-  cpu      every task, and one pendulum on one thread beside IPOPT
-  gpu      more chains, and 16,384 random pendulums
-  devices  one solve on 1, 2, 4, ... devices
-  peers    ablations, IPOPT, MPPI, CEM and model-based diffusion
+  cpu          every task, and one pendulum on one thread beside IPOPT
+  gpu          more chains, and 16,384 random pendulums
+  devices      one solve on 1, 2, 4, ... devices
+  peers        ablations, IPOPT, MPPI, CEM and model-based diffusion
+  convergence  iterations from one guess to a tolerance of 1e-8, in float64 beside IPOPT; textbook
+               problems and programs besides tasks; writes convergence.json
 
 IPOPT needs pip install "mjx-drax[peers]". The exit status is 0 if all rows of this solver are
-certified.
+certified; of the suite convergence it is 0.
 """
 
 from __future__ import annotations
@@ -34,7 +36,11 @@ def run(options: argparse.Namespace) -> int:
     """Print each row as it is ready, and save them all."""
     from mjx_drax.solution.save import writable
     from mjx_drax.studies import benchmark
+    from mjx_drax.studies.convergence import suite
 
+    if options.suite == suite.NAME:
+        suite.run(options.tasks, writable(options.out), say)
+        return 0
     benchmark.check(options.tasks, options.suite)
     folder = writable(options.out)
     say(benchmark.HEADER)

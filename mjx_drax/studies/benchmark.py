@@ -33,6 +33,7 @@ from mjx_drax.search.engine import cost_scale_of
 from mjx_drax.search.iterate import evaluate
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.studies import one_thread
+from mjx_drax.studies.convergence.suite import NAME as CONVERGENCE
 from mjx_drax.studies.measurements import (
     OURS,
     STARTS,
@@ -133,7 +134,9 @@ def check(names: Sequence[str], suite: str | None) -> None:
             casadi, which is not installed.
     """
     if suite is not None and suite not in SUITES:
-        raise DraxError(f"there is no suite {suite!r}: choose one of {', '.join(SUITES)}.")
+        raise DraxError(
+            f"there is no suite {suite!r}: choose one of {', '.join([*SUITES, CONVERGENCE])}."
+        )
     known = SUITES[suite][1]() if suite else tasks.names()
     for name in names:
         tasks.load(name)

@@ -30,7 +30,7 @@ from mjx_drax.problem.trajectory import Trajectory
 require_casadi = partial(require, "casadi", "peers", "IPOPT")
 """Complains if casadi is not installed."""
 
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "print_time": False,
     "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": 3000},
 }

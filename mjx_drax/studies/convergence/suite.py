@@ -1,0 +1,168 @@
+"""The suite `convergence`: iterations from one plain guess to a tolerance of 1e-8, beside IPOPT.
+
+    problems  textbook optimal control (`optimal_control`), smooth tasks, and programs of Hock and
+              Schittkowski (`programs`)
+    guess     a straight line of states and controls in the middle of their box; for programs the
+              starting point of the book
+    IPOPT     the same program from the same guess, exact derivatives, tol 1e-8, at most 500
+              iterations; left out if casadi is not installed
+
+All is computed in float64, in a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax import tasks
+from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import write_json
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.studies.convergence.optimal_control import CASES, straight
+from mjx_drax.studies.convergence.programs import PROGRAMS
+from mjx_drax.studies.other_methods import ipopt_jax
+from mjx_drax.studies.other_methods.ipopt import has_casadi
+
+Row = dict[str, Any]
+
+NAME = "convergence"
+
+TASKS: dict[str, Sequence[float] | None] = {
+    "pendulum": [0.0, 0.0],
+    "pendulum_swingup": [np.pi, 0.0],
+    "cartpole_swingup": [0.0, np.pi, 0.0, 0.0],
+    "acrobot_swingup": [np.pi, 0.0, 0.0, 0.0],
+    "double_pendulum_swingup": [0.0, np.pi, 0.0, 0.0, 0.0, 0.0],
+    "quadrotor_planar": [2.5, 1.0, 0.0, 0.0, 0.0, 0.0],
+    "quadrotor": [2.5, 0.0, 1.0, 1.0, *[0.0] * 9],
+    "arm_reach": None,
+    "bug_trap": [1.0, 0.0, 0.0],
+    "deep_trap": [1.0, 0.0, 0.0],
+}
+"""The smooth tasks, and where the straight line of their guess ends; None: the start is held."""
+
+HEADER = (
+    "| problem | numbers | IPOPT iterations | IPOPT cost | IPOPT status | iterations | cost "
+    "| residual | status | / IPOPT |\n" + "|---" * 10 + "|"
+)
+
+
+def names() -> tuple[str, ...]:
+    """All problems of the suite, in the order of the table."""
+    return (*CASES, *TASKS, *PROGRAMS)
+
+
+def posed(name: str) -> tuple[Problem, Trajectory]:
+    """A problem of the suite and its guess, x (K, nx) and u (K, nu).
+
+    Raises:
+        DraxError: there is no such problem.
+    """
+    if name in CASES:
+        problem = CASES[name].make()
+        return problem, CASES[name].guess(problem)
+    if name in TASKS:
+        problem = tasks.load(name).make()
+        return problem, straight(problem, TASKS[name])
+    if name in PROGRAMS:
+        point = jnp.asarray([PROGRAMS[name].start])
+        return PROGRAMS[name].problem(name), Trajectory(jnp.zeros((1, 0)), point)
+    raise DraxError(f"the suite convergence has no {name}: it has {', '.join(names())}.")
+
+
+def ours(problem: Problem, knots: Trajectory) -> tuple[int, float, float, str]:
+    """Iterations, scaled KKT residual, cost and status of this library's local method."""
+    raise NotImplementedError
+
+
+def measure(name: str) -> Row:
+    """A row of the table. Needs `jax_enable_x64`."""
+    problem, knots = posed(name)
+    row: Row = {"problem": name, "numbers": int(knots.x.size + knots.u.size)}
+    if has_casadi():
+        answer = ipopt_jax.solve(problem, knots)
+        row |= {
+            "ipopt_iterations": answer.iterations,
+            "ipopt_cost": answer.cost,
+            "ipopt_status": answer.status,
+        }
+    try:
+        iterations, residual, cost, status = ours(problem, knots)
+    except NotImplementedError:
+        return row
+    row |= {"iterations": iterations, "residual": residual, "cost": cost, "status": status}
+    if row.get("ipopt_iterations"):
+        row["ratio"] = iterations / row["ipopt_iterations"]
+    return row
+
+
+def line(row: Row) -> str:
+    """A row of the table, in Markdown."""
+
+    def cell(key: str, form: str = "") -> str:
+        return format(row[key], form) if key in row else "-"
+
+    return (
+        f"| {row['problem']} | {row['numbers']} | {cell('ipopt_iterations')} "
+        f"| {cell('ipopt_cost', '.8g')} | {cell('ipopt_status')} | {cell('iterations')} "
+        f"| {cell('cost', '.8g')} | {cell('residual', '.0e')} | {cell('status')} "
+        f"| {cell('ratio', '.2f')} |"
+    )
+
+
+def run(chosen: Sequence[str], folder: Path, report: Callable[[str], None]) -> list[Row]:
+    """Measure in a process of its own; report the table line by line; write `convergence.json`.
+
+    Args:
+        chosen: problems; all if empty.
+        folder: where the list of rows is written, after each row.
+        report: called with every line.
+
+    Raises:
+        DraxError: there is no such problem, or the process fails.
+    """
+    for name in chosen:
+        if name not in names():
+            posed(name)
+    report(HEADER)
+    rows = []
+    for row in _rows(chosen or names()):
+        rows.append(row)
+        report(line(row))
+        write_json(folder / "convergence.json", rows)
+    return rows
+
+
+def _rows(chosen: Sequence[str]) -> Iterator[Row]:
+    """Rows as a process with float64 prints them."""
+    paths = os.pathsep.join(p or os.getcwd() for p in sys.path)
+    with subprocess.Popen(
+        [sys.executable, "-m", __name__, *chosen],
+        env=os.environ | {"JAX_ENABLE_X64": "1", "PYTHONPATH": paths},
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        for text in process.stdout:
+            if text.startswith("{"):  # IPOPT may print too
+                yield json.loads(text)
+    if process.returncode:
+        raise DraxError(
+            f"the suite convergence ended with status {process.returncode}: see above for the "
+            "reason, or give the names of the problems to measure."
+        )
+
+
+if __name__ == "__main__":
+    for each in sys.argv[1:]:
+        print(json.dumps(measure(each)), flush=True)
