@@ -43,6 +43,7 @@ from .solution.program import from_program as from_program
 from .solution.program import minimize as minimize
 from .solution.solution import Solution as Solution
 from .solution.solve import solve as solve
+from .solution.violations import Tolerances as Tolerances
 from .studies.lbfgs import LBFGS as LBFGS
 from .view.browser import save_html as save_html
 from .view.diffusion import render_diffusion as render_diffusion

@@ -29,6 +29,7 @@ from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.problem.trajectory import Stagewise
 from mjx_drax.solution.export import NothingToExport
 from mjx_drax.solution.replay import Replays
+from mjx_drax.solution.violations import KINDS, Tolerances, Violations
 
 INF, NAN = math.inf, math.nan
 
@@ -108,7 +109,9 @@ def made_up(problem, chains=2):
     x, u = np.zeros((chains, K, d.nx), np.float32), np.zeros((chains, K, d.nu), np.float32)
     zero, whole = np.zeros(chains, np.float32), np.zeros(chains, int)
     states, good = np.zeros((chains, K + 1, d.nx)), np.ones(chains, bool)
-    replays = Replays(states, u, zero, zero, zero, zero, good)
+    none = np.zeros((chains, len(KINDS)))
+    kept = Violations(none, none + NAN, none.astype(int) - 1, none.astype(int) - 1)
+    replays = Replays(states, u, zero, zero, zero, zero, good, kept)
     constraints = Stagewise(np.zeros((chains, K, 0)), np.zeros((chains, 0)))
     return Solution(
         problem=problem,
@@ -120,10 +123,15 @@ def made_up(problem, chains=2):
         cost=zero,
         max_defect=zero,
         max_violation=zero,
-        converged_at=whole,
+        residual=zero + NAN,
+        tolerance=1e-4,
+        feasible_since=whole,
         died_at=whole - 1,
+        interrupted=False,
+        plan=kept,
         open_loop=replays,
         feedback=replays,
+        tolerances=Tolerances(),
         history={
             "iteration": np.arange(2),
             "cost": np.zeros((2, chains)),

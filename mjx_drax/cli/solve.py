@@ -1,12 +1,14 @@
 """Solve a task, or a model and cost of your own; replay it; film it.
 
-The exit status is 0 only if the best trajectory is certified.
+The exit status is 0 only if the best trajectory is certified: its replay reaches the goal and keeps
+all bounds and constraints. It is optimal too if its residual is below a tolerance.
 
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,6 +20,7 @@ from mjx_drax.cli.progress import Bar
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
     from mjx_drax.search.restarts import Restarts
+    from mjx_drax.solution.violations import Tolerances
 
 __doc__ += cost_file.HELP
 
@@ -73,6 +76,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a setting of the solver, as in attempts=3, flow.tail=100 or "
         "flow.noise=Geometric(3,0.001); again for more; a wrong name lists them all",
     )
+    add(
+        "--tolerance",
+        dest="tolerances",
+        action="append",
+        default=[],
+        metavar="KIND=VALUE",
+        help="which violations of a replay are tolerated, in your units, as in inequality=0.01 or "
+        "state_bounds=1e-3,1e-2; relative=0.005 is the share of a scale of the problem's own for "
+        "all others; again for more; a wrong name lists them all",
+    )
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
@@ -95,6 +108,8 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.view.video import check as require_drawing
 
     settled(problem, chains, options.seed, solver)  # refuses settings that cannot work
+    tolerances = _tolerances(options.tolerances)
+    tolerances.of(problem)
     wanted = export.chosen(options)
     for each in wanted:
         each.check(problem)
@@ -119,6 +134,7 @@ def run(options: argparse.Namespace) -> int:
             progress=None if options.quiet else bar,
             record=1 if film else None,
             checkpoint=options.checkpoint,
+            tolerances=tolerances,
         )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]
@@ -142,6 +158,28 @@ def run(options: argparse.Namespace) -> int:
     if options.json and not options.quiet:
         print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
     return 0 if solution.certified else 1
+
+
+def _tolerances(texts: list[str]) -> Tolerances:
+    """The tolerances that KIND=VALUE says, the default ones for other kinds."""
+    from mjx_drax.solution.violations import Tolerances
+
+    given = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        known = [field.name for field in fields(Tolerances)]
+        if not equals or name not in known:
+            raise DraxError(
+                f"--tolerance {text!r}: give KIND=VALUE, KIND one of {', '.join(known)}."
+            )
+        try:
+            numbers = [float(number) for number in value.split(",")]
+        except ValueError as error:
+            raise DraxError(
+                f"--tolerance {text!r}: give a number, or one for each entry as in 1e-3,1e-2."
+            ) from error
+        given[name] = numbers[0] if len(numbers) == 1 else numbers
+    return Tolerances(**given)  # type: ignore[arg-type]
 
 
 class Asked(NamedTuple):

@@ -4,27 +4,48 @@ from __future__ import annotations
 
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.violations import GOAL, TRACKING, words
 
 OPTIMA = 5
 """So many distinct optima are printed."""
 
 
 def lines(solution: Solution) -> list[str]:
-    """Chains, the best one, its replays, distinct optima, times, and the verdict."""
+    """Chains, the best one, the three parts of its certificate, distinct optima, times, verdict."""
     best, status = solution.best_chain, solution.status
     counts = ", ".join(f"{status.count(name)} {name}" for name in sorted(set(status)))
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     return [
         f"chains         {solution.chains}: {counts}; {rate}",
-        f"best           cost {solution.cost[best]:.5g}, max|h| {solution.max_defect[best]:.1e}, "
-        f"bound violation {solution.max_violation[best]:.1e}",
-        *(f"{mode:14} {solution.outcome(mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
+        f"best           cost {solution.replay_cost[best]:.5g} when replayed "
+        f"{solution.replay_mode}; plan: {solution.cost[best]:.5g}, max|h| "
+        f"{solution.max_defect[best]:.1e}",
+        *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
+        f"constraints    {constraints(solution)}",
+        f"optimality     {solution.optimality}",
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
-        "CERTIFIED" if solution.certified else "NOT CERTIFIED: " + _advice(solution),
+        solution.verdict if solution.certified else f"{solution.verdict}: {_advice(solution)}",
     ]
+
+
+def _replay(solution: Solution, mode: str) -> str:
+    """What one of the best chain's replays came to."""
+    cost = solution.replays_in(mode).cost[solution.best_chain]
+    return f"{solution.outcome(mode)}, cost {cost:.5g}"
+
+
+def constraints(solution: Solution) -> str:
+    """The largest violation of each kind on the best chain's better replay."""
+    violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
+    told = [
+        f"{words(v.kind)} {v.size:.1e} of {v.allowed:.1e}"
+        for v in violations
+        if v.kind not in (GOAL, TRACKING)
+    ]
+    return "largest violations: " + "; ".join(told) if told else "the problem has none"
 
 
 def optima_lines(solution: Solution) -> list[str]:
@@ -32,15 +53,18 @@ def optima_lines(solution: Solution) -> list[str]:
     found = solution.optima
     if len(found) < 2:
         return ["optima         one: certified chains agree on the motion"] if found else []
-    words = ("misses goal", "reaches goal")
+    outcomes = ("fails", "reaches goal")
     if solution.problem.goal is None:
-        words = ("leaves plan", "keeps to plan")
-    table = [f"optima         rank {'cost':>9}  chains  {'open loop':13}  with feedback"]
+        outcomes = ("fails", "keeps to plan")
+    table = [
+        f"optima         rank {'cost':>9}  chains  {'open loop':13}  {'with feedback':13}  residual"
+    ]
     for rank, optimum in enumerate(found[:OPTIMA], 1):
         replays = optimum.certificate.open_loop, optimum.certificate.feedback
-        open_loop, feedback = (words[replay["success"]] for replay in replays)
+        open_loop, feedback = (outcomes[replay["success"]] for replay in replays)
         table.append(
-            f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback}"
+            f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback:13}  "
+            f"{optimum.residual:.1e}"
         )
     if len(found) > OPTIMA:
         table.append(f"{'':14} and {len(found) - OPTIMA} more")
@@ -49,9 +73,14 @@ def optima_lines(solution: Solution) -> list[str]:
 
 def _advice(solution: Solution) -> str:
     """What to try when no chain could be certified."""
-    if not solution.feasible.any():
-        return "no chain satisfies the dynamics. Try more --iterations, or a longer --horizon."
+    where = solution.where(solution.best_chain)
+    if where is not None:
+        return (
+            f"no plan is feasible; the best {where.told(solution.problem)}. Try more --iterations, "
+            "or a longer --horizon."
+        )
     return (
-        "feasible chains miss the goal when replayed. Try more --chains, a higher weight on the "
-        "terminal cost, or a longer --horizon."
+        "feasible chains miss the goal or break constraints when replayed. Try more --chains, a "
+        "higher weight on the terminal cost, or a longer --horizon; --tolerance says what counts "
+        "as broken."
     )

@@ -17,8 +17,7 @@ from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import plain
-from mjx_drax.problem.trajectory import Trajectory
-from mjx_drax.search.iterate import Question, cost_and_violation, partition
+from mjx_drax.search.iterate import Question, partition
 
 
 @dataclass(frozen=True)
@@ -186,14 +185,15 @@ class Family:
         axes = jax.tree.unflatten(tree, [0 if d else None for d in self.differs])
         return jax.vmap(function, in_axes=(axes,))(self.problem)
 
-    def cost_and_violation(self, knots: Trajectory) -> tuple[Array, Array]:
-        """Cost and bound violation of a trajectory for each problem, (N,), from knots (N, ...)."""
+    @property
+    def parts(self) -> tuple[Problem, Problem]:
+        """What each problem has of its own (N, ...), and what all share; None for the others."""
         leaves, tree = jax.tree.flatten(self.problem)
-        parts = (
-            [leaf if d is own else None for leaf, d in zip(leaves, self.differs, strict=True)]
-            for own in (True, False)
+        own, shared = (
+            [leaf if d is is_own else None for leaf, d in zip(leaves, self.differs, strict=True)]
+            for is_own in (True, False)
         )
-        return cost_and_violation(*(jax.tree.unflatten(tree, part) for part in parts), knots)
+        return jax.tree.unflatten(tree, own), jax.tree.unflatten(tree, shared)
 
     def replay(
         self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray

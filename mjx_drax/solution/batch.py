@@ -25,7 +25,15 @@ from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE, ranking
 from mjx_drax.search.restarts import Restarts, settled
-from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK, Replays, judged
+from mjx_drax.solution.replay import (
+    OPEN_LOOP,
+    WITH_FEEDBACK,
+    Replays,
+    both_ways,
+    open_loop_is_better,
+)
+from mjx_drax.solution.results import RESIDUAL, statuses
+from mjx_drax.solution.violations import Tolerances, as_tolerances
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
@@ -44,8 +52,12 @@ class BatchSolution:
         x: states x_0..x_K, (N, K + 1, nx).
         u: controls, (N, K, nu).
         gains: feedback (N, K, nu, ndx).
-        chain_cost, chain_defect: cost and max|h| of all chains, (N, chains).
+        chain_cost, chain_defect: cost and max|h| of all chains' plans, (N, chains).
+        chain_residual: of the optimality conditions of all chains, NaN if not known, (N, chains).
+        tolerance: below which a residual is that of an optimum.
         best: which chain is in x and u, (N,).
+        interrupted: whether the solve was ended before its time.
+        tolerances: of violations of replays.
         open_loop, feedback: replays of the best chains, over problems.
         compile_time, solve_time, replay_time: [s].
     """
@@ -56,7 +68,11 @@ class BatchSolution:
     gains: np.ndarray
     chain_cost: np.ndarray
     chain_defect: np.ndarray
+    chain_residual: np.ndarray
+    tolerance: float
     best: np.ndarray
+    interrupted: bool
+    tolerances: Tolerances
     open_loop: Replays
     feedback: Replays
     compile_time: float
@@ -65,13 +81,27 @@ class BatchSolution:
 
     @property
     def cost(self) -> np.ndarray:
-        """Of the best chains, (N,)."""
-        return np.take_along_axis(self.chain_cost, self.best[:, None], 1)[:, 0]
+        """Of the better replays of the best chains, infinite for what was not solved, (N,)."""
+        cost = np.where(self.open_loop_is_better, self.open_loop.cost, self.feedback.cost)
+        return np.where(np.isfinite(self.plan_cost), cost, np.inf)
+
+    @property
+    def plan_cost(self) -> np.ndarray:
+        """Of the best chains' plans, (N,)."""
+        return self._of_best(self.chain_cost)
 
     @property
     def max_defect(self) -> np.ndarray:
         """max|h| of the best chains, (N,)."""
-        return np.take_along_axis(self.chain_defect, self.best[:, None], 1)[:, 0]
+        return self._of_best(self.chain_defect)
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Of the best chains, (N,)."""
+        return self._of_best(self.chain_residual)
+
+    def _of_best(self, values: np.ndarray) -> np.ndarray:
+        return np.take_along_axis(values, self.best[:, None], 1)[:, 0]
 
     @property
     def feasible(self) -> np.ndarray:
@@ -84,9 +114,25 @@ class BatchSolution:
         return self.feasible & (self.open_loop.success | self.feedback.success)
 
     @property
+    def optimal(self) -> np.ndarray:
+        """Whether the plan is certified and its residual below the tolerance, (N,)."""
+        return self.certified & (self.residual < self.tolerance)
+
+    @property
+    def status(self) -> list[str]:
+        """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, of every problem."""
+        finite = np.isfinite(self.x).all(axis=(1, 2)) & np.isfinite(self.u).all(axis=(1, 2))
+        return statuses(self.feasible, self.optimal, ~finite, self.interrupted)
+
+    @property
+    def open_loop_is_better(self) -> np.ndarray:
+        """Which replay speaks for each plan: the one that succeeds, then the cheaper; (N,)."""
+        return open_loop_is_better(self.open_loop, self.feedback)
+
+    @property
     def replay_modes(self) -> list[str]:
-        """How each is to be replayed: open loop where that succeeds."""
-        return [OPEN_LOOP if ok else WITH_FEEDBACK for ok in self.open_loop.success]
+        """How each is to be replayed: as succeeds, then as is cheaper."""
+        return [OPEN_LOOP if better else WITH_FEEDBACK for better in self.open_loop_is_better]
 
 
 def solve_batch(
@@ -99,6 +145,7 @@ def solve_batch(
     progress: Callable[[int, int], None] | None = None,
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
+    tolerances: Tolerances | None = None,
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
 
@@ -116,6 +163,7 @@ def solve_batch(
         devices: how many of this process to spread a chunk over, evenly; see `solve`.
         checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
             there, as in `solve`.
+        tolerances: by how much replays may break bounds and constraints; see `Tolerances`.
 
     Raises:
         DraxError: as `solve`; values without a common first axis; a problem with NaN, crossed
@@ -127,11 +175,13 @@ def solve_batch(
     require_whole("chains", chains)
     require_functions(progress=progress)
     family = Family.of(make, values)
+    tolerances = as_tolerances(tolerances)
+    tolerances.of(family.at(0))  # refuses those of another size
     settings = settled(family.at(0), chains, seed, solver)
     file = None if checkpoint is None else Checkpoint(checkpoint)
     size = chunk or (file and file.answered("chunk")) or fitting(family.at(0), chains)
     size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()
-    found = Search(
+    search = Search(
         family,
         chains,
         seed,
@@ -140,28 +190,28 @@ def solve_batch(
         mesh=mesh_for(size, devices),
         checkpoint=file,
         chunk_done=progress,
-    ).run()
-    return _certified(family, chains, found)
+    )
+    found = search.run()
+    interrupted = search.stage.place < len(search.stage.todo)
+    return _certified(family, chains, found, interrupted, tolerances)
 
 
-def _certified(family: Family, chains: int, found: Found) -> BatchSolution:
+def _certified(
+    family: Family, chains: int, found: Found, interrupted: bool, tolerances: Tolerances
+) -> BatchSolution:
     """The best chain of every problem, replayed."""
-    clock, everyone = time.perf_counter(), np.arange(family.count)
+    clock = time.perf_counter()
     info, shape = found.chains.info, (family.count, chains)
     cost, defect = (np.reshape(a, shape) for a in (info.cost, info.max_defect))
     infeasible, value = ranking(cost, defect)
     best = np.lexsort((value, infeasible), axis=1)[:, 0]
-    state, rows = found.chains.state, everyone * chains + best
+    state, rows = found.chains.state, np.arange(family.count) * chains + best
     x, u, gains = (
         np.asarray(a)[rows] for a in (state.trajectory.x, state.trajectory.u, state.gains)
     )
     start = np.broadcast_to(family.problem.x_init, (family.count, x.shape[-1]))
     plan = np.concatenate([start[:, None], x], axis=1)
-
-    def replayed(share: float) -> Replays:
-        ran = family.replay(everyone, plan, u, share * gains)
-        return judged(family.at(0), plan, ran, family.cost_and_violation)
-
+    open_loop, feedback = both_ways(family, plan, u, gains, tolerances)
     return BatchSolution(
         family=family,
         x=plan,
@@ -169,9 +219,13 @@ def _certified(family: Family, chains: int, found: Found) -> BatchSolution:
         gains=gains,
         chain_cost=cost,
         chain_defect=defect,
+        chain_residual=np.full(shape, np.nan),
+        tolerance=RESIDUAL,
         best=best,
-        open_loop=replayed(0.0),
-        feedback=replayed(1.0),
+        interrupted=interrupted,
+        tolerances=tolerances,
+        open_loop=open_loop,
+        feedback=feedback,
         compile_time=found.compile_time,
         solve_time=found.solve_time,
         replay_time=time.perf_counter() - clock,

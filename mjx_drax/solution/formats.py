@@ -18,70 +18,17 @@ import numpy.typing as npt
 from mjx_drax import __version__
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path, require
-from mjx_drax.physics.dynamics import MjxDynamics, mujoco_model
+from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import Source
-from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.export import NothingToExport
+from mjx_drax.solution.names import control_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.solution import Solution
 
 DATASET_FORMAT = 1
 """Of HDF5 files; changes whenever what they hold is named or shaped otherwise."""
-
-_POSITIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
-}
-_VELOCITIES = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
-}
-
-
-# Names
-
-
-def state_names(dynamics: Dynamics) -> list[str]:
-    """Names of the entries of a state, nx of them.
-
-    For a model qpos_JOINT, qvel_JOINT and act_ACTUATOR, in MuJoCo's units; joints with several
-    coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise x0,
-    x1, ...
-    """
-    model = mujoco_model(dynamics)
-    if model is None:
-        return [f"x{i}" for i in range(dynamics.nx)]
-    return [
-        *_joint_names(model, "qpos", _POSITIONS),
-        *_joint_names(model, "qvel", _VELOCITIES),
-        *_activation_names(model),
-    ]
-
-
-def control_names(dynamics: Dynamics) -> list[str]:
-    """Names of the entries of a control, nu of them: ctrl_ACTUATOR, or u0, u1, ..."""
-    model = mujoco_model(dynamics)
-    if model is None:
-        return [f"u{i}" for i in range(dynamics.nu)]
-    return [f"ctrl_{model.actuator(i).name or i}" for i in range(model.nu)]
-
-
-def _joint_names(
-    model: mujoco.MjModel, kind: str, parts: dict[int, tuple[str, ...]]
-) -> Iterator[str]:
-    for i in range(model.njnt):
-        name = f"{kind}_{model.joint(i).name or i}"
-        for part in parts.get(int(model.jnt_type[i]), ("",)):
-            yield f"{name}_{part}" if part else name
-
-
-def _activation_names(model: mujoco.MjModel) -> Iterator[str]:
-    for i in range(model.nu):
-        name, count = model.actuator(i).name or i, int(model.actuator_actnum[i])
-        for part in range(count):
-            yield f"act_{name}" if count == 1 else f"act_{name}_{part}"
 
 
 # CSV
@@ -186,10 +133,10 @@ def save_dataset(
 
     One group a solution, `000_NAME`, with n trajectories of K knots: times (K+1,); states (n, K+1,
     nx) and controls (n, K, nu) as replayed, float64; plan_states, plan_controls and gains (n, K,
-    nu, ndx), float32; mode (n,), `open loop` where that succeeds, else `with feedback`; and of that
-    replay max_deviation, final_deviation, max_violation, replay_cost and success, (n,) each; chain,
-    cost and max_defect of the plan, feasible. Attributes: problem, engine, seed, dt, state_names,
-    control_names; of the file: format, mjx_drax.
+    nu, ndx), float32; mode (n,), `open loop` or `with feedback`, whichever succeeds and is cheaper;
+    and of that replay max_deviation, final_deviation, max_violation, replay_cost and success, (n,)
+    each; chain, cost, max_defect and residual of the plan, feasible, optimal. Attributes: problem,
+    engine, seed, dt, state_names, control_names; of the file: format, mjx_drax.
 
     Args:
         solutions: one, or several, from `solve` or `Solution.load`.
@@ -227,9 +174,9 @@ def save_dataset(
 def _trajectories(solution: Solution, everything: bool) -> dict[str, Any]:
     """The trajectories of one solution, cheapest first, replayed in their modes."""
     open_loop, feedback = solution.open_loop, solution.feedback
-    order = np.argsort(solution.cost, kind="stable")
+    order = np.argsort(solution.replay_cost, kind="stable")
     chains = order[solution.certified_chains[order] | everything]
-    is_open = open_loop.success[chains]
+    is_open = solution.open_loop_is_better[chains]
 
     def replayed(name: str) -> np.ndarray:
         one, other = (getattr(replays, name)[chains] for replays in (open_loop, feedback))
@@ -251,5 +198,7 @@ def _trajectories(solution: Solution, everything: bool) -> dict[str, Any]:
         "chain": chains,
         "cost": solution.cost[chains],
         "max_defect": solution.max_defect[chains],
+        "residual": solution.residual[chains],
         "feasible": solution.feasible[chains],
+        "optimal": solution.optimal_chains[chains],
     }

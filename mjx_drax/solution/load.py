@@ -44,6 +44,7 @@ from mjx_drax.search.settings import from_data
 from mjx_drax.solution.replay import Replays
 from mjx_drax.solution.results import Results
 from mjx_drax.solution.save import ARRAYS, FORMAT, SUMMARY, json_digest
+from mjx_drax.solution.violations import KINDS, Tolerances, Violations
 
 Arrays = dict[str, np.ndarray]
 Loaded = TypeVar("Loaded", bound=Results)
@@ -141,10 +142,15 @@ def _solution(
         cost=arrays["chain_cost"],
         max_defect=arrays["chain_max_defect"],
         max_violation=arrays["chain_max_violation"],
-        converged_at=arrays["chain_converged_at"],
+        residual=arrays["chain_residual"],
+        tolerance=summary["tolerance"],
+        feasible_since=arrays["chain_feasible_since"],
         died_at=arrays["chain_died_at"],
-        open_loop=Replays(**_within("solution.open_loop.", arrays)),
-        feedback=Replays(**_within("solution.feedback.", arrays)),
+        interrupted=summary["interrupted"],
+        plan=Violations(**_within("solution.plan.", arrays)),
+        open_loop=_replays("solution.open_loop.", arrays),
+        feedback=_replays("solution.feedback.", arrays),
+        tolerances=from_data(summary["tolerances"]),
         history=history,
         iterations=summary["iterations"],
         compile_time=summary["compile_time_s"],
@@ -168,8 +174,16 @@ def _require_consistent(solution: Results, summary: dict[str, Any]) -> None:
         "gains": (solution.gains, (chains, K, nu, dynamics.ndx)),
         "multipliers": (solution.multipliers.dynamics, (chains, K, dynamics.ndx)),
     }
-    for name in ("cost", "max_defect", "max_violation", "converged_at", "died_at"):
+    numbers = ("cost", "max_defect", "max_violation", "residual", "feasible_since", "died_at")
+    for name in numbers:
         shapes[name] = getattr(solution, name), (chains,)
+    for mode, violations in (
+        ("plan", solution.plan),
+        ("open_loop", solution.open_loop.violations),
+        ("feedback", solution.feedback.violations),
+    ):
+        for name, array in vars(violations).items():
+            shapes[f"violations of {mode}, {name}"] = array, (chains, len(KINDS))
     for mode in ("open_loop", "feedback"):
         replays = getattr(solution, mode)
         shapes[f"{mode}.states"] = replays.states, (chains, K + 1, nx)
@@ -185,15 +199,24 @@ def _require_consistent(solution: Results, summary: dict[str, Any]) -> None:
     require_whole("horizon of the saved solution", summary["horizon"])
     require_whole("seed of the saved solution", solution.seed, 0)
     require_positive("dt of the saved solution", float(dynamics.dt))
-    if not isinstance(solution.solver, Restarts):
-        raise DraxError(
-            f"the saved solution is damaged: its solver is {shown(solution.solver)}. Solve again."
-        )
+    require_positive("tolerance of the saved solution", solution.tolerance)
+    for name, kind in (("solver", Restarts), ("tolerances", Tolerances), ("interrupted", bool)):
+        value = getattr(solution, name)
+        if not isinstance(value, kind):
+            raise DraxError(
+                f"the saved solution is damaged: its {name} is {shown(value)}. Solve again."
+            )
 
 
 def _within(prefix: str, arrays: Arrays) -> Arrays:
     """The arrays whose names begin so, without it."""
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _replays(label: str, arrays: Arrays) -> Replays:
+    named = _within(label, arrays)
+    own = {name: array for name, array in named.items() if "." not in name}
+    return Replays(**own, violations=Violations(**_within("violations.", named)))
 
 
 def _stagewise(label: str, arrays: Arrays) -> Any:

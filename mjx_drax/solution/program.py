@@ -30,6 +30,9 @@ from mjx_drax.search.engine import Progress, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.solution.replay import plan_violations
+from mjx_drax.solution.results import RESIDUAL, statuses
+from mjx_drax.solution.violations import Violation
 
 
 def from_program(
@@ -85,27 +88,62 @@ class Minimum:
     """Where the chains of a nonlinear program ended. Arrays are numpy's.
 
     Attributes:
+        program: what was solved.
         x: (chains, n).
         equality: multipliers of h, (chains, m).
         inequality: multipliers of g, (chains, mg).
         cost: c(x), (chains,).
         max_defect: largest |h| or positive g, (chains,).
+        residual: of the optimality conditions, scaled; NaN if not known, (chains,).
+        tolerance: below which a residual is that of an optimum.
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
+        interrupted: whether the solve was ended before its time.
     """
 
+    program: Problem
     x: np.ndarray
     equality: np.ndarray
     inequality: np.ndarray
     cost: np.ndarray
     max_defect: np.ndarray
+    residual: np.ndarray
+    tolerance: float
     died_at: np.ndarray
+    interrupted: bool
+
+    @cached_property
+    def feasible(self) -> np.ndarray:
+        """Whether the largest |h| or positive g is below 1e-3, (chains,)."""
+        return (self.max_defect < FEASIBLE) & (self.died_at < 0)
+
+    @cached_property
+    def optimal_chains(self) -> np.ndarray:
+        """Whether a chain is feasible and its residual below the tolerance, (chains,)."""
+        return self.feasible & (self.residual < self.tolerance)
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the best chain is."""
+        return bool(self.optimal_chains[self.best_chain])
+
+    @cached_property
+    def status(self) -> list[str]:
+        """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, for every chain."""
+        return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
+
+    def where(self, chain: int) -> Violation | None:
+        """The constraint that an infeasible chain breaks most; None for a feasible one."""
+        if self.feasible[chain]:
+            return None
+        states, u = np.zeros((1, 2, 0)), self.x[chain, None, None]
+        found = plan_violations(Family.of_one(self.program), states, u).of(0)
+        return max((v for v in found if "equality" in v.kind), key=lambda v: v.size, default=None)
 
     @cached_property
     def best_chain(self) -> int:
         """The cheapest feasible chain, else the least infeasible one."""
-        feasible = (self.max_defect < FEASIBLE) & (self.died_at < 0)
-        if feasible.any():
-            return int(np.argmin(np.where(feasible, self.cost, np.inf)))
+        if self.feasible.any():
+            return int(np.argmin(np.where(self.feasible, self.cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
 
     @property
@@ -148,16 +186,21 @@ def minimize(
     require_functions(progress=progress)
     settings = settled(program, chains, seed, solver)
     mesh = mesh_for(chains)
-    found = Search(
+    search = Search(
         Family.of_one(program), chains, seed, settings, mesh=mesh, guess=knots, progress=progress
-    ).run()
+    )
+    found = search.run()
     state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
     multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
     return Minimum(
+        program=program,
         x=np.asarray(state.trajectory.u[:, 0]),
         equality=multipliers[:, :rows],
         inequality=multipliers[:, rows:],
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
+        residual=np.full(chains, np.nan),
+        tolerance=RESIDUAL,
         died_at=np.asarray(state.died_at),
+        interrupted=search.stage.place < len(search.stage.todo),
     )

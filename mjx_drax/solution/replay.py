@@ -6,31 +6,37 @@ the feedback
     u_k + K_k (x_k - x_k^plan),   clipped to the control bounds,
 
 where K is the time-varying LQR that the solver's factorization yields. A replay succeeds if it
-reaches the goal and leaves the bounds by `OUTSIDE` at most; without a goal, if it ends within
-`TRACKED` of the plan.
+reaches the goal, or ends as planned where there is none, and keeps all bounds and constraints,
+within their tolerances; see `violations`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
-
-TRACKED = 1e-2
-"""Largest final deviation |x - plan| of a successful replay, where the problem has no goal."""
-
-OUTSIDE = 1e-2
-"""How far a replay that succeeds may leave the bounds of the states."""
+from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.solution.violations import (
+    DYNAMICS,
+    GOAL,
+    KINDS,
+    TRACKING,
+    Tolerances,
+    Violation,
+    Violations,
+    extents,
+    measured,
+)
 
 OPEN_LOOP, WITH_FEEDBACK = "open loop", "with feedback"
+
+ROUNDING = 1e-5
+"""Costs of replays, summed in float32, are alike if they differ by this share."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,8 @@ class Replays:
     """What the engine did with every chain's controls.
 
     states (chains, K+1, nx), controls (chains, K, nu), largest deviation from the plan over the
-    whole motion and at its end, bound violation, cost, and whether it succeeded, (chains,) each.
+    whole motion and at its end, largest distance from the box of the bounds, cost, and whether it
+    succeeded, (chains,) each; and the largest violation of each kind.
     """
 
     states: np.ndarray
@@ -48,16 +55,32 @@ class Replays:
     max_violation: np.ndarray
     cost: np.ndarray
     success: np.ndarray
+    violations: Violations
 
     def summary(self, chain: int) -> dict[str, Any]:
         """One chain's numbers."""
         return {
+            "success": bool(self.success[chain]),
+            "cost": float(self.cost[chain]),
             "max_deviation": float(self.max_deviation[chain]),
             "final_deviation": float(self.final_deviation[chain]),
             "max_violation": float(self.max_violation[chain]),
-            "cost": float(self.cost[chain]),
-            "success": bool(self.success[chain]),
+            "violations": self.violations.data(chain),
         }
+
+    def outcome(self, problem: Problem, chain: int) -> str:
+        """What one chain's replay came to, in words."""
+        if not np.isfinite(self.max_deviation[chain]):
+            return "diverges"
+        broken = [v for v in self.violations.of(chain) if v.broken and v.kind != GOAL]
+        if broken:
+            words = max(broken, key=lambda v: v.ratio).told(problem)
+            missed = self.violations.size[chain, KINDS.index(GOAL)] > 0
+            return f"misses the goal and {words}" if missed else words
+        words = ("misses the goal", "reaches the goal")[int(self.success[chain])]
+        if problem.goal is None:
+            words = ("leaves the plan", "keeps to the plan")[int(self.success[chain])]
+        return f"{words}, {self.max_deviation[chain]:.1e} off plan"
 
 
 @dataclass(frozen=True)
@@ -70,53 +93,123 @@ class Certificate:
 
     @property
     def success(self) -> bool:
-        """Whether one of the two replays reached the goal."""
+        """Whether one of the two replays reached the goal and kept all constraints."""
         return bool(self.open_loop["success"] or self.feedback["success"])
 
 
-def replays(problem: Problem, trajectories: Trajectory, gains: np.ndarray) -> Replays:
+def open_loop_is_better(open_loop: Replays, feedback: Replays) -> np.ndarray:
+    """Whether the replay without feedback is the better one, (chains,).
+
+    It is if it succeeds, and the one with feedback does not or is no cheaper. Costs that differ by
+    rounding count as equal.
+    """
+    one, other = open_loop.cost, feedback.cost
+    no_cheaper = (one <= other) | np.isclose(one, other, ROUNDING, 0.0)
+    return open_loop.success & (no_cheaper | ~feedback.success)
+
+
+def replays(
+    problem: Problem,
+    trajectories: Trajectory,
+    gains: np.ndarray,
+    tolerances: Tolerances | None = None,
+) -> Replays:
     """Every chain's controls, applied from x_0 with the given feedback gains."""
     plan = np.asarray(problem.with_start(trajectories), float)
-    ran = problem.replay(plan, trajectories.u, gains)
-    return judged(problem, plan, ran, Family.of_one(problem).cost_and_violation)
+    u = np.asarray(trajectories.u)
+    ran = problem.replay(plan, u, gains)
+    return judged(Family.of_one(problem), plan, u, ran, tolerances or Tolerances())
+
+
+def both_ways(
+    family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray, tolerances: Tolerances
+) -> tuple[Replays, Replays]:
+    """Replays of plans, open loop and with feedback: one of each problem, or all of one.
+
+    Args:
+        family: the problems.
+        plan: planned states x_0..x_K, (n, K + 1, nx).
+        u: planned controls, (n, K, nu).
+        gains: feedback, (n, K, nu, ndx).
+        tolerances: what is tolerated.
+    """
+    which = np.arange(family.count)
+
+    def replayed(share: float) -> Replays:
+        ran = family.replay(which, plan, u, share * gains)
+        return judged(family, plan, u, ran, tolerances)
+
+    return replayed(0.0), replayed(1.0)
 
 
 def judged(
-    problem: Problem,
+    family: Family,
     plan: np.ndarray,
+    u: np.ndarray,
     ran: tuple[np.ndarray, np.ndarray],
-    cost_and_violation: Callable[[Trajectory], tuple[Array, Array]],
+    tolerances: Tolerances,
 ) -> Replays:
-    """Replays with their costs, bound violations and successes.
+    """Replays with their costs, violations and successes.
 
     Args:
-        problem: for its goal, its state arithmetic and its precision.
-        plan: planned states x_0..x_K, (runs, K + 1, nx).
-        ran: replayed states, of the same shape, and the controls that were applied (runs, K, nu).
-        cost_and_violation: gives cost and bound violation of a batch of trajectories.
+        family: the problems, for their functions and bounds.
+        plan: planned states x_0..x_K, (n, K + 1, nx), and
+        u: controls (n, K, nu), whose extent gives violations their scale.
+        ran: replayed states and controls, of the same shapes.
+        tolerances: what is tolerated.
     """
-    states, controls = ran
-    off = np.nan_to_num(problem.dynamics.deviation(states, plan), nan=np.inf)
-    dtype = problem.x_init.dtype
-    knots = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
-    cost, outside = cost_and_violation(knots)
-    ends = zip(states[:, -1], off[:, -1], strict=True)
-    reached = [_reached(problem, x, deviation) for x, deviation in ends]
-    violation = np.nan_to_num(np.asarray(outside), nan=np.inf)
+    problem, (states, controls) = family.at(0), ran
+    off = np.nan_to_num(problem.dynamics.host_difference(states, plan), nan=np.inf)
+    cost, violations = measured(family, ran, off[:, -1], extents(problem, plan, u), tolerances)
+    place = KINDS.index(GOAL)
+    if problem.goal is not None:
+        reached = np.array([problem.reached(x) for x in states[:, -1]])
+        finite = np.isfinite(states[:, -1]).all(axis=1)
+        violations.size[:, place] = ~(reached & finite)
+        violations.allowed[:, place] = 0.0
+        violations.knot[:, place] = problem.horizon
+        violations.allowed[:, KINDS.index(TRACKING)] = np.nan
     return Replays(
         states=states,
         controls=controls,
-        max_deviation=off.max(axis=1),
-        final_deviation=off[:, -1],
-        max_violation=violation,
-        cost=np.asarray(cost),
-        success=np.array(reached) & (violation < OUTSIDE),
+        max_deviation=np.abs(off).max(axis=(1, 2), initial=0.0),
+        final_deviation=np.abs(off[:, -1]).max(axis=1, initial=0.0),
+        max_violation=bounds_left(violations),
+        cost=cost,
+        success=violations.kept & np.isfinite(states).all(axis=(1, 2)),
+        violations=violations,
     )
 
 
-def _reached(problem: Problem, x: np.ndarray, deviation: float) -> bool:
-    """Whether a replay that ends at x (nx,), off its plan by `deviation`, is a success."""
-    if not np.isfinite(x).all():
-        return False
-    reached = problem.reached(x)
-    return bool(deviation < TRACKED) if reached is None else reached
+def bounds_left(violations: Violations) -> np.ndarray:
+    """Largest distance from the box of the bounds, (motions,)."""
+    places = [KINDS.index(kind) for kind in ("state_bounds", "control_bounds")]
+    return violations.size[:, places].max(axis=1)
+
+
+def plan_violations(family: Family, plan: np.ndarray, u: np.ndarray) -> Violations:
+    """Violations of plans themselves, but of the dynamics, by the default tolerances."""
+    off = np.zeros((len(u), family.problem.dynamics.ndx))
+    found = measured(family, (plan, u), off, extents(family.at(0), plan, u), Tolerances())[1]
+    found.allowed[:, KINDS.index(TRACKING)] = np.nan
+    return found
+
+
+def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violation:
+    """Where one plan breaks the dynamics most: each knot's step, taken again from its own state.
+
+    Args:
+        problem: for its engine.
+        plan: x_0..x_K, (K + 1, nx).
+        u: controls, (K, nu).
+
+    Raises:
+        DraxError: the problem was loaded without f.
+    """
+    dynamics, steps = problem.dynamics, np.stack([plan[:-1], plan[1:]], axis=1)
+    free, gains = np.array(np.inf), np.zeros((len(u), 1, dynamics.nu, dynamics.ndx))
+    ran, _ = dynamics.replay(steps, np.asarray(u, float)[:, None], gains, (-free, free))
+    off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
+    off = np.nan_to_num(off, nan=np.inf)
+    knot, entry = np.unravel_index(int(off.argmax()), off.shape)
+    return Violation(DYNAMICS, float(off[knot, entry]), FEASIBLE, int(entry), int(knot))

@@ -1,7 +1,14 @@
 """What came of a solve: all chains, how they replay, and the distinct optima.
 
 A cost alone says nothing, because an infeasible trajectory undercuts the optimum. So every chain's
-controls are replayed from x_init; see `replay`.
+controls are replayed from x_init (see `replay`), and three things are said of each:
+
+    replays       it reaches the goal, or ends as planned, open loop or with feedback
+    constraints   the same replay keeps all bounds and constraints, within tolerances
+    optimality    the residual of the optimality conditions of its plan is below a tolerance
+
+It is *certified* if its plan is feasible and the first two hold, and *optimal* if all three do. The
+better one of its two replays, which succeeds and is cheaper, speaks for a chain.
 """
 
 from __future__ import annotations
@@ -12,7 +19,7 @@ from functools import cached_property
 import jax
 import numpy as np
 
-from mjx_drax.base.errors import require_positive
+from mjx_drax.base.errors import DraxError, require_positive
 from mjx_drax.method.model import Multipliers
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
@@ -22,14 +29,19 @@ from mjx_drax.search.restarts import Restarts
 from mjx_drax.solution.optima import TOLERANCE, cluster
 from mjx_drax.solution.replay import (
     OPEN_LOOP,
-    OUTSIDE,
-    TRACKED,
     WITH_FEEDBACK,
     Certificate,
     Replays,
+    largest_defect,
+    open_loop_is_better,
 )
+from mjx_drax.solution.violations import DYNAMICS, Tolerances, Violation, Violations
 
-CONVERGED, INFEASIBLE, DIVERGED = "converged", "infeasible", "diverged"
+OPTIMAL, FEASIBLE_ONLY, INFEASIBLE = "optimal", "feasible", "infeasible"
+DIVERGED, INTERRUPTED = "diverged", "interrupted"
+
+RESIDUAL = 1e-4
+"""Residual below which a chain counts as optimal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +52,22 @@ class Optimum:
         chain: index of the cheapest chain, which represents it.
         members: indices of all its chains, cheapest first, (members,).
         share: of all chains of the solve, those that failed included.
-        cost, max_defect: of the representative.
+        cost: of the representative's better replay.
+        plan_cost, max_defect, residual: of the representative's plan.
+        optimal: whether that residual is below the tolerance.
         certificate: how the representative replays, open loop and with feedback.
         trajectory: knots of the representative, x_1..x_K (K, nx) and u_0..u_{K-1} (K, nu).
-        replayed: states (K+1, nx) and controls (K, nu) of its replay: open loop where that
-            succeeds, else with feedback.
+        replayed: states (K+1, nx) and controls (K, nu) of its better replay.
     """
 
     chain: int
     members: np.ndarray
     share: float
     cost: float
+    plan_cost: float
     max_defect: float
+    residual: float
+    optimal: bool
     certificate: Certificate
     trajectory: Trajectory
     replayed: tuple[np.ndarray, np.ndarray]
@@ -68,10 +84,17 @@ class Results:
         trajectories: knots, (chains, K, nx) and (chains, K, nu), and slacks of inequalities.
         multipliers: lambda, of dynamics (chains, K, ndx) and constraints, and those of bounds.
         gains: feedback K_k, (chains, K, nu, ndx).
-        cost, max_defect, max_violation: of every chain, (chains,).
-        converged_at: iteration since which max|h| < 1e-3, else -1, (chains,).
+        cost, max_defect, max_violation: of every chain's plan, (chains,).
+        residual: of the optimality conditions of every chain's plan, scaled: the largest of the
+            Lagrangian's slope, defects, constraints and complementarity; NaN if not known,
+            (chains,).
+        tolerance: below which a residual is that of an optimum.
+        feasible_since: iteration since which max|h| < 1e-3, else -1, (chains,).
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
+        interrupted: whether the solve was ended before its time.
+        plan: violations of bounds and constraints of every chain's plan.
         open_loop, feedback: the replays of every chain.
+        tolerances: of violations of replays.
         history: `iteration` (records,), and `cost`, `max_defect` (records, chains) of every place
             in the batch, which in later attempts of `Restarts` hold tries for unfinished chains;
             `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
@@ -91,10 +114,15 @@ class Results:
     cost: np.ndarray
     max_defect: np.ndarray
     max_violation: np.ndarray
-    converged_at: np.ndarray
+    residual: np.ndarray
+    tolerance: float
+    feasible_since: np.ndarray
     died_at: np.ndarray
+    interrupted: bool
+    plan: Violations
     open_loop: Replays
     feedback: Replays
+    tolerances: Tolerances
     history: dict[str, np.ndarray]
     iterations: int
     compile_time: float
@@ -114,7 +142,7 @@ class Results:
 
     @cached_property
     def success(self) -> np.ndarray:
-        """Whether a chain is feasible and its replay with feedback reaches the goal, (chains,)."""
+        """Whether a chain is feasible and its replay with feedback succeeds, (chains,)."""
         return self.feasible & self.feedback.success
 
     @property
@@ -123,32 +151,67 @@ class Results:
         return float(self.success.mean())
 
     @cached_property
-    def status(self) -> list[str]:
-        """`converged`, `infeasible` or `diverged`, for every chain."""
-        names = np.where(self.feasible, CONVERGED, INFEASIBLE)
-        return np.where(self.died_at >= 0, DIVERGED, names).tolist()
-
-    @cached_property
     def certified_chains(self) -> np.ndarray:
         """Whether a chain is feasible and one of its replays succeeds, (chains,)."""
         return self.feasible & (self.open_loop.success | self.feedback.success)
 
     @cached_property
-    def tracked(self) -> np.ndarray:
-        """Whether a chain is feasible, and a replay of it succeeds and ends as planned, (chains,).
+    def optimal_chains(self) -> np.ndarray:
+        """Whether a chain is certified and its residual below the tolerance, (chains,)."""
+        return self.certified_chains & (self.residual < self.tolerance)
 
-        In contact a goal can be reached by a motion that has little to do with the plan.
+    @cached_property
+    def status(self) -> list[str]:
+        """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, for every chain.
+
+        Feasible is a plan that obeys the dynamics and its constraints, whether or not a replay of
+        it succeeds. Interrupted is what was infeasible when the solve was ended before its time.
         """
-        both = (self.open_loop, self.feedback)
-        return self.feasible & np.any([r.success & (r.final_deviation < TRACKED) for r in both], 0)
+        return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
+
+    @cached_property
+    def open_loop_is_better(self) -> np.ndarray:
+        """Which replay speaks for a chain: the one that succeeds, then the cheaper; (chains,)."""
+        return open_loop_is_better(self.open_loop, self.feedback)
+
+    @cached_property
+    def replay_cost(self) -> np.ndarray:
+        """Costs of the better replays, (chains,)."""
+        return np.where(self.open_loop_is_better, self.open_loop.cost, self.feedback.cost)
 
     @cached_property
     def best_chain(self) -> int:
-        """The cheapest that is tracked, succeeds or is feasible; else the least infeasible."""
-        for eligible in (self.tracked, self.certified_chains, self.feasible):
+        """The certified chain with the cheapest replay; else a feasible, or the least infeasible.
+
+        Of feasible chains the one with the cheapest plan.
+        """
+        for eligible, cost in (
+            (self.certified_chains, self.replay_cost),
+            (self.feasible, self.cost),
+        ):
             if eligible.any():
-                return int(np.argmin(np.where(eligible, self.cost, np.inf)))
+                return int(np.argmin(np.where(eligible, cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
+
+    def where(self, chain: int) -> Violation | None:
+        """What keeps a chain's plan from being feasible: the largest defect or constraint.
+
+        Returns:
+            what is broken, by how much, in which entry, at which knot; None for a feasible chain.
+            Entry and knot are -1 if the defects of a problem that was loaded without f are largest.
+        """
+        if self.feasible[chain]:
+            return None
+        found = [v for v in self.plan.of(chain) if "equality" in v.kind]
+        states = np.asarray(self.problem.with_start(self.trajectories), float)[chain]
+        try:
+            found.append(
+                largest_defect(self.problem, states, np.asarray(self.trajectories.u[chain]))
+            )
+        except DraxError:  # f is not there
+            defect = float(np.nan_to_num(self.max_defect[chain], nan=np.inf))
+            found.insert(0, Violation(DYNAMICS, defect, FEASIBLE, -1, -1))
+        return max(found, key=lambda v: v.size)
 
     @property
     def best(self) -> Trajectory:
@@ -171,32 +234,65 @@ class Results:
 
     @property
     def certified(self) -> bool:
-        """Whether the best chain is feasible and a replay of it succeeds."""
-        return bool(self.feasible[self.best_chain]) and self.certificate.success
+        """Whether the best chain is feasible, and a replay reaches the goal and keeps constraints.
+
+        Without a goal, a replay has to end as planned.
+        """
+        return bool(self.certified_chains[self.best_chain])
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the best chain is certified, and its residual is below the tolerance."""
+        return bool(self.optimal_chains[self.best_chain])
 
     @property
     def replay_mode(self) -> str:
-        """Which replay speaks for the best chain: open loop where that succeeds."""
-        return OPEN_LOOP if self.certificate.open_loop["success"] else WITH_FEEDBACK
+        """Which replay speaks for the best chain: the one that succeeds, then the cheaper."""
+        return OPEN_LOOP if self.open_loop_is_better[self.best_chain] else WITH_FEEDBACK
+
+    def replays_in(self, mode: str) -> Replays:
+        """The replays of all chains in a mode."""
+        return self.open_loop if mode == OPEN_LOOP else self.feedback
 
     def outcome(self, mode: str) -> str:
         """What the best chain's replay in that mode came to, in words."""
-        certificate = self.certificate
-        replay = certificate.open_loop if mode == OPEN_LOOP else certificate.feedback
-        if not np.isfinite(replay["max_deviation"]):
-            return "diverges"
-        if replay["max_violation"] >= OUTSIDE:
-            return f"leaves the bounds by {replay['max_violation']:.1e}"
-        words = ("misses the goal", "reaches the goal")
-        if self.problem.goal is None:
-            words = ("leaves the plan", "keeps to the plan")
-        return f"{words[replay['success']]}, {replay['max_deviation']:.1e} off plan"
+        return self.replays_in(mode).outcome(self.problem, self.best_chain)
+
+    @property
+    def optimality(self) -> str:
+        """What is known of the best chain's optimality, in words."""
+        return optimality(float(self.residual[self.best_chain]), self.tolerance)
+
+    @property
+    def verdict(self) -> str:
+        """The three parts of the certificate, in a few words."""
+        if not self.certified:
+            return "NOT CERTIFIED"
+        return "CERTIFIED and optimal" if self.optimal else "CERTIFIED, not known to be optimal"
 
     @property
     def replayed(self) -> tuple[np.ndarray, np.ndarray]:
         """States (K+1, nx) and controls (K, nu) of the best chain, replayed in `replay_mode`."""
-        replays = self.open_loop if self.replay_mode == OPEN_LOOP else self.feedback
+        replays = self.replays_in(self.replay_mode)
         return replays.states[self.best_chain], replays.controls[self.best_chain]
+
+
+def statuses(
+    feasible: np.ndarray, optimal: np.ndarray, diverged: np.ndarray, interrupted: bool
+) -> list[str]:
+    """The status of every chain, from what is known of it, (chains,) each."""
+    names = np.where(optimal, OPTIMAL, np.where(feasible, FEASIBLE_ONLY, INFEASIBLE))
+    if interrupted:
+        names = np.where(feasible, names, INTERRUPTED)
+    found: list[str] = np.where(diverged, DIVERGED, names).tolist()
+    return found
+
+
+def optimality(residual: float, tolerance: float) -> str:
+    """What a residual says, in words."""
+    if np.isnan(residual):
+        return "residual not known"
+    return f"residual {residual:.1e}, {'below' if residual < tolerance else 'above'} {tolerance:g}"
 
 
 def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, ...]:
@@ -214,7 +310,7 @@ def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, 
     certified = np.flatnonzero(solution.certified_chains)
     if not certified.size:
         return ()
-    order = certified[np.argsort(solution.cost[certified], kind="stable")]
+    order = certified[np.argsort(solution.replay_cost[certified], kind="stable")]
     group = cluster(solution.problem.dynamics, solution.trajectories.x[order], tolerance)
     return tuple(_optimum(solution, order[group == g]) for g in range(group.max() + 1))
 
@@ -223,13 +319,16 @@ def _optimum(solution: Results, members: np.ndarray) -> Optimum:
     """What is known of the chains of one optimum, cheapest first."""
     chain = int(members[0])
     open_loop, feedback = solution.open_loop, solution.feedback
-    replays = open_loop if open_loop.success[chain] else feedback
+    replays = open_loop if solution.open_loop_is_better[chain] else feedback
     return Optimum(
         chain=chain,
         members=members,
         share=len(members) / solution.chains,
-        cost=float(solution.cost[chain]),
+        cost=float(solution.replay_cost[chain]),
+        plan_cost=float(solution.cost[chain]),
         max_defect=float(solution.max_defect[chain]),
+        residual=float(solution.residual[chain]),
+        optimal=bool(solution.optimal_chains[chain]),
         certificate=Certificate(solution.engine, open_loop.summary(chain), feedback.summary(chain)),
         trajectory=jax.tree.map(lambda a: a[chain], solution.trajectories),
         replayed=(replays.states[chain], replays.controls[chain]),

@@ -31,10 +31,10 @@ from mjx_drax.solution.results import Optimum, Results
 
 SUMMARY, ARRAYS = "result.json", "result.npz"
 
-FORMAT = 2
+FORMAT = 3
 """Changes whenever files that were written before can no longer be loaded."""
 
-WHOLE = ("trajectories", "multipliers", "gains", "open_loop", "feedback")
+WHOLE = ("trajectories", "multipliers", "gains", "plan", "open_loop", "feedback")
 """Attributes of a solution that are written for all chains, by their names."""
 
 PICTURES = 5_000_000
@@ -48,6 +48,7 @@ def summary(solution: Results) -> dict[str, Any]:
     """What `result.json` holds: settings, the best chain's numbers, certificate, versions."""
     best, certificate = solution.best_chain, solution.certificate
     status, dynamics = solution.status, solution.problem.dynamics
+    where = solution.where(best)
     whole: dict[str, Any] = {
         "format": FORMAT,
         "task": solution.problem.name,
@@ -64,16 +65,25 @@ def summary(solution: Results) -> dict[str, Any]:
         "solve_time_s": solution.solve_time,
         "best_chain": best,
         "certified": solution.certified,
-        "cost": solution.cost[best],
+        "optimal": solution.optimal,
+        "residual": solution.residual[best],
+        "tolerance": solution.tolerance,
+        "interrupted": solution.interrupted,
+        "replay_mode": solution.replay_mode,
+        "cost": solution.replay_cost[best],
+        "plan_cost": solution.cost[best],
         "max_defect": solution.max_defect[best],
         "max_bound_violation": solution.max_violation[best],
+        "infeasible_where": None if where is None else {"kind": where.kind, **where.data()},
         "success_rate": solution.success_rate,
+        "optimal_rate": float(solution.optimal_chains.mean()),
         "status": {name: status.count(name) for name in sorted(set(status))},
         "certificate": {
             "engine": certificate.engine,
             "open_loop": certificate.open_loop,
             "feedback": certificate.feedback,
         },
+        "tolerances": to_data(solution.tolerances),
         "optima_found": len(solution.optima),
         "optima": [_answer(optimum) for optimum in solution.optima[:OPTIMA]],
         "versions": versions(),
@@ -123,7 +133,9 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
         "chain_max_violation": solution.max_violation,
         "chain_success": solution.success,
         "chain_status": np.array(solution.status),
-        "chain_converged_at": solution.converged_at,
+        "chain_replay_cost": solution.replay_cost,
+        "chain_residual": solution.residual,
+        "chain_feasible_since": solution.feasible_since,
         "chain_died_at": solution.died_at,
         **{f"history_{name}": values for name, values in solution.history.items()},
     }
@@ -134,7 +146,10 @@ def _answer(optimum: Optimum) -> dict[str, Any]:
     return {
         "chain": optimum.chain,
         "cost": optimum.cost,
+        "plan_cost": optimum.plan_cost,
         "max_defect": optimum.max_defect,
+        "residual": optimum.residual,
+        "optimal": optimum.optimal,
         "members": len(optimum.members),
         "share": optimum.share,
         "open_loop": optimum.certificate.open_loop,

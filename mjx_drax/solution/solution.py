@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from mjx_drax.problem.problem import Problem
+from mjx_drax.search.family import Family
 from mjx_drax.solution.load import load
-from mjx_drax.solution.replay import replays
+from mjx_drax.solution.replay import both_ways
 from mjx_drax.solution.results import Results
 from mjx_drax.solution.save import save
+from mjx_drax.solution.violations import Tolerances, as_tolerances
 
 
 class Solution(Results):
@@ -43,16 +45,19 @@ class Solution(Results):
         """
         return load(Solution, folder, problem)
 
-    def certify(self) -> Solution:
+    def certify(self, tolerances: Tolerances | None = None) -> Solution:
         """The same solution with every chain replayed again, by the engine that is here now.
 
+        Args:
+            tolerances: of violations of the replays; by default those that it was solved with.
+
         Raises:
-            DraxError: it was loaded without its problem, whose cost and goal judge replays.
+            DraxError: it was loaded without its problem, whose cost and goal judge replays;
+                tolerances that do not fit.
         """
-        problem, plans = self.problem, self.trajectories
-        return replace(
-            self,
-            open_loop=replays(problem, plans, np.zeros_like(self.gains)),
-            feedback=replays(problem, plans, self.gains),
-            engine=problem.dynamics.engine,
-        )
+        problem, u = self.problem, np.asarray(self.trajectories.u)
+        chosen = self.tolerances if tolerances is None else as_tolerances(tolerances)
+        plan = np.asarray(problem.with_start(self.trajectories), float)
+        ran = both_ways(Family.of_one(problem), plan, u, self.gains, chosen)
+        engine = problem.dynamics.engine
+        return replace(self, open_loop=ran[0], feedback=ran[1], tolerances=chosen, engine=engine)

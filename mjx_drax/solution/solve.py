@@ -20,8 +20,10 @@ from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import Question, feedback_gains, partition
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
-from mjx_drax.solution.replay import replays
+from mjx_drax.solution.replay import both_ways, plan_violations
+from mjx_drax.solution.results import RESIDUAL
 from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.violations import Tolerances, as_tolerances
 
 
 def solve(
@@ -34,6 +36,7 @@ def solve(
     record: int | None = None,
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
+    tolerances: Tolerances | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
 
@@ -55,19 +58,22 @@ def solve(
         checkpoint: a file to write every half minute, and to go on from where it is there, after
             the same call was killed or ended by Ctrl-C. The answer is the same, bit for bit. A
             file that belongs to a complete solve gives its answer again; it may be deleted.
+        tolerances: by how much replays may break bounds and constraints; see `Tolerances`.
 
     Returns:
-        the solution with its certificate; look at `solution.certified`.
+        the solution with its certificate; look at `solution.certified` and `solution.optimal`.
 
     Raises:
-        DraxError: sizes that misfit; functions that cannot be differentiated, compute something
-            else each time, or are finite, with their derivatives, at no initial knot; a checkpoint
-            that cannot be written, is damaged or belongs to another solve.
+        DraxError: sizes that misfit, of tolerances too; functions that cannot be differentiated,
+            compute something else each time, or are finite, with their derivatives, at no initial
+            knot; a checkpoint that cannot be written, is damaged or belongs to another solve.
     """
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     require_functions(progress=progress)
+    tolerances = as_tolerances(tolerances)
+    tolerances.of(problem)  # refuses those of another size
     settings = settled(problem, chains, seed, solver)
     recorder = None if record is None else Recorder(record)
     search = Search(
@@ -81,11 +87,20 @@ def solve(
         recorder=recorder,
         progress=progress,
     )
-    solution = _certified(problem, settings, seed, search.run())
+    found = search.run()
+    interrupted = search.stage.place < len(search.stage.todo)
+    solution = _certified(problem, settings, seed, found, interrupted, tolerances)
     return solution if recorder is None else replace(solution, recording=recorder.recording())
 
 
-def _certified(problem: Problem, settings: Restarts, seed: int, found: Found) -> Solution:
+def _certified(
+    problem: Problem,
+    settings: Restarts,
+    seed: int,
+    found: Found,
+    interrupted: bool,
+    tolerances: Tolerances,
+) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
     state, info, records = found.chains.state, found.chains.info, found.records
     trajectories = jax.tree.map(np.asarray, state.trajectory)
@@ -93,6 +108,9 @@ def _certified(problem: Problem, settings: Restarts, seed: int, found: Found) ->
     if not settings.flow.preconditioner.has_gains:
         shared, own = partition(Question(settings.flow, problem), None)
         gains = np.asarray(feedback_gains(own, shared, state))
+    family, plan = Family.of_one(problem), np.asarray(problem.with_start(trajectories), float)
+    u = np.asarray(trajectories.u)
+    open_loop, feedback = both_ways(family, plan, u, gains, tolerances)
     return Solution(
         problem=problem,
         solver=settings,
@@ -103,10 +121,15 @@ def _certified(problem: Problem, settings: Restarts, seed: int, found: Found) ->
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
         max_violation=np.asarray(info.max_violation),
-        converged_at=np.where(np.asarray(state.died_at) < 0, found.chains.feasible_since, -1),
+        residual=np.full(len(gains), np.nan),
+        tolerance=RESIDUAL,
+        feasible_since=np.where(np.asarray(state.died_at) < 0, found.chains.feasible_since, -1),
         died_at=np.asarray(state.died_at),
-        open_loop=replays(problem, trajectories, np.zeros_like(gains)),
-        feedback=replays(problem, trajectories, gains),
+        interrupted=interrupted,
+        plan=plan_violations(family, plan, u),
+        open_loop=open_loop,
+        feedback=feedback,
+        tolerances=tolerances,
         history={
             "iteration": np.array([done for done, _ in records]),
             "cost": np.stack([np.asarray(i.cost) for _, i in records]),

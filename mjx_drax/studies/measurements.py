@@ -50,6 +50,7 @@ from mjx_drax.search.restarts import Restarts, as_restarts
 from mjx_drax.solution.replay import Replays, judged
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
+from mjx_drax.solution.violations import Tolerances
 from mjx_drax.studies.many_starts import solve_each
 from mjx_drax.studies.other_methods import shooting
 
@@ -160,12 +161,12 @@ def ours(
         chains,
         iterations=solution.iterations,
         certified=solution.certified,
-        best_cost=float(solution.cost[best]),
+        best_cost=float(solution.replay_cost[best]),
         max_defect=float(solution.max_defect[best]),
         evaluations=evaluations(solver, problem, chains, solution.iterations),
         open_loop_deviation=certificate.open_loop["max_deviation"],
         feedback_deviation=certificate.feedback["max_deviation"],
-        median_success_cost=float(np.median(solution.cost[solution.success]))
+        median_success_cost=float(np.median(solution.replay_cost[solution.success]))
         if solution.success.any()
         else None,
         compile_time_s=solution.compile_time,
@@ -211,7 +212,7 @@ def _interrupted(solution: Solution, probes: int) -> list[tuple[float, float, fl
 
 
 def _judged(solution: Solution) -> tuple[float, float, float]:
-    close = solution.success & near(solution.problem, solution.cost)
+    close = solution.success & near(solution.problem, solution.replay_cost)
     return solution.solve_time, solution.success_rate, float(close.mean())
 
 
@@ -227,8 +228,8 @@ def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> 
         x_init: where each replay starts, (n, nx); by default the problem's for all.
     """
     ran = _replayed(problem, u, x_init)
-    values = Family.of_one(problem).cost_and_violation
-    return judged(problem, ran[0], ran, values)  # as if what happened had been planned
+    # As if what happened had been planned
+    return judged(Family.of_one(problem), *ran, ran, Tolerances())
 
 
 def _replayed(

@@ -32,7 +32,7 @@ from mjx_drax.base.files import complete, file_path, require
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import finite
-from mjx_drax.solution.replay import OPEN_LOOP, TRACKED
+from mjx_drax.solution.replay import OPEN_LOOP
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.geoms import Floats, Surface, mean_color, surface_of
 from mjx_drax.view.scene import Scene, camera_for, posed
@@ -49,6 +49,7 @@ GHOSTS = 8
 _GHOST_OPACITY, _PLAN_OPACITY = 0.15, 0.5
 _PLAN_SCALE = 1.03  # a shell around the replay, where the two coincide
 _PLAN_COLOR = np.array([0.12, 0.44, 0.70])
+_ALIKE = 1e-2  # a plan from which the replay deviates by less is hidden at first
 _PATH_COLOR = (217, 84, 30)
 _GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
 _SMOOTH = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_ELLIPSOID)
@@ -147,7 +148,7 @@ def _recorded(solution: Solution, ghosts: int) -> str:
                 _add_shape(scene, f"/world/{shape.label}", shape, float(model.stat.extent))
         frames = _add_robot(scene, "replay", shapes, replayed, None)
         frames += _add_robot(scene, "plan", shapes, planned, _PLAN_COLOR)
-        scene.add_frame("/plan", show_axes=False, visible=not follows["max_deviation"] < TRACKED)
+        scene.add_frame("/plan", show_axes=False, visible=not follows["max_deviation"] < _ALIKE)
         _add_ghosts(scene, shapes, planned, ghosts)
         _add_path(scene, shapes, replayed)
         recorder = server.get_scene_serializer()

@@ -168,9 +168,9 @@ def _title(solution: Solution) -> str:
     chain, certificate = solution.best_chain, solution.certificate
     return "\n".join(
         [
-            f"{solution.problem.name}: {'certified' if solution.certified else 'NOT CERTIFIED'}",
-            f"cost {solution.cost[chain]:.4g},  max|h| {solution.max_defect[chain]:.1g},  "
-            f"bound violation {solution.max_violation[chain]:.1g},  "
+            f"{solution.problem.name}: {solution.verdict}",
+            f"cost {solution.replay_cost[chain]:.4g} (plan {solution.cost[chain]:.4g}),  "
+            f"max|h| {solution.max_defect[chain]:.1g},  {solution.optimality},  "
             f"{solution.success_rate:.0%} of {solution.chains} chains succeed",
             *(
                 f"{certificate.engine}, {mode}: {solution.outcome(mode)}"
@@ -351,15 +351,17 @@ def _draw_costs(axes: Axes, solution: Solution) -> None:
 
 
 def _draw_final_costs(axes: Axes, solution: Solution) -> None:
-    """Final costs in rising order; what is infeasible may undercut the optimum."""
-    cost = np.asarray(solution.cost, float)
+    """Final costs in rising order, of replays; what is infeasible may undercut the optimum."""
+    certified = solution.certified_chains
+    cost = np.where(certified, solution.replay_cost, solution.cost).astype(float)
     rank = np.empty(len(cost), int)
     rank[np.argsort(cost, kind="stable")] = np.arange(1, len(cost) + 1)
     diverged = solution.died_at >= 0
     handles: list[Artist] = []
     for name, chosen, marker, color in (
-        ("succeeds", solution.success, "o", GREEN),
-        ("feasible, replay fails", solution.feasible & ~solution.success, "s", ORANGE),
+        ("optimal", solution.optimal_chains, "*", GREEN),
+        ("certified", certified & ~solution.optimal_chains, "o", GREEN),
+        ("feasible, replays fail", solution.feasible & ~certified, "s", ORANGE),
         ("infeasible", ~solution.feasible & ~diverged, "x", VERMILLION),
         ("diverged", diverged, "+", BLACK),
     ):

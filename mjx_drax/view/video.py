@@ -170,20 +170,20 @@ def motion_frames(
 def outcome_lines(solution: Solution) -> list[str]:
     """Lines of text about the best chain, short ones, which leave the robot in view."""
     chain, mode = solution.best_chain, solution.replay_mode
-    cost, defect, violation = (
-        float(a[chain]) for a in (solution.cost, solution.max_defect, solution.max_violation)
-    )
+    cost, defect = float(solution.replay_cost[chain]), float(solution.max_defect[chain])
+    violation = float(solution.replays_in(mode).max_violation[chain])
     has_model = mujoco_model(solution.problem.dynamics) is not None
     lines = [
         solution.problem.name,
         f"cost {cost:.3g}   max|h| {defect:.1g}",
         f"bound violation {violation:.1g}",
+        solution.optimality,
         f"{'MuJoCo C replay' if has_model else 'float64 rollout'}, {mode}:",
         solution.outcome(mode),
         "t = {time}",
     ]
     if not solution.certified:
-        infeasible = "the plan breaks the dynamics"
+        infeasible = "the plan is infeasible"
         reason = "no replay succeeds" if solution.feasible[chain] else infeasible
         lines.insert(1, f"{UNCERTIFIED}: {reason}")
     return lines

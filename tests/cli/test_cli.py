@@ -121,6 +121,7 @@ def test_own_model_is_certified_and_written(own, capsys):
     for replay in ("open_loop", "feedback"):
         assert set(result["certificate"][replay]) == {
             "max_violation",
+            "violations",
             "max_deviation",
             "final_deviation",
             "cost",
@@ -145,6 +146,8 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     assert status == 1
     out = capsys.readouterr().out
     assert "NOT CERTIFIED" in out
+    assert "constraints    largest violations: control bounds 0.0e+00 of" in out
+    assert "optimality     residual not known" in out
     assert "there from an earlier solve: replay.csv\n" in out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]
     assert not (tmp_path / "video.mp4").exists()

@@ -107,7 +107,8 @@ def test_a_dataset_holds_certified_trajectories_only(slider, tmp_path):
         np.testing.assert_array_equal(first["controls"][best], slider.replayed[1])
         np.testing.assert_array_equal(first["plan_controls"][best], slider.best.u)
         assert first["max_deviation"][best] == slider.certificate.open_loop["max_deviation"]
-        assert (np.diff(first["cost"]) >= 0).all()
+        assert (np.diff(first["replay_cost"]) >= 0).all()
+        assert not first["optimal"][:].any()
     hopeless = replace(slider, max_defect=np.ones(4))
     with pytest.raises(NothingToExport, match="no chain is certified, so the dataset would be"):
         save_dataset(hopeless, tmp_path / "none.h5")

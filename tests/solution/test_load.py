@@ -52,7 +52,10 @@ def folder(slider, tmp_path):
 def everything(solution):
     """Every array and number of a solution, but the problem."""
     parts = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name != "problem"}
-    parts |= {mode: vars(parts[mode]) for mode in ("open_loop", "feedback")}
+    parts |= {mode: dict(vars(parts[mode])) for mode in ("plan", "open_loop", "feedback")}
+    for mode in ("open_loop", "feedback"):
+        parts[mode]["violations"] = vars(parts[mode]["violations"])
+    parts |= {"tolerances": vars(parts["tolerances"])}
     return parts
 
 
@@ -64,7 +67,7 @@ def test_all_comes_back(name, request, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, everything(again), everything(solution))
     kinds = [jax.tree.map(lambda a: np.asarray(a).dtype, s.trajectories) for s in (again, solution)]
     assert kinds[0] == kinds[1]
-    for said in ("certificate", "certified", "best_chain", "status", "replay_mode", "success_rate"):
+    for said in ("certificate", "certified", "best_chain", "status", "replay_mode", "verdict"):
         assert getattr(again, said) == getattr(solution, said)
     for mode in ("open loop", "with feedback"):
         assert again.outcome(mode) == solution.outcome(mode)
@@ -119,13 +122,13 @@ def test_files_that_are_refused(folder, tmp_path):
         Solution.load(tmp_path / "nowhere")
     rewritten(folder, format=7)
     with pytest.raises(
-        DraxError, match=r"has format 7 .* this version reads format 2: solve again"
+        DraxError, match=r"has format 7 .* this version reads format 3: solve again"
     ):
         Solution.load(folder)
     rewritten(folder, format=None)
     with pytest.raises(DraxError, match="has no format number"):
         Solution.load(folder)
-    rewritten(folder, format=2, settings={"part": "Nonsense"})
+    rewritten(folder, format=3, settings={"part": "Nonsense"})
     with pytest.raises(DraxError, match="Another version of mjx_drax wrote them"):
         Solution.load(folder)
     rewritten(folder, settings=None, certificate={})

@@ -117,7 +117,9 @@ def test_diverged_chains_and_replays(pendulum: Solution, kind: str, tmp_path: Pa
 def test_title_tells_what_the_replays_did(pendulum: Solution) -> None:
     lines = plotting._title(pendulum).split("\n")
     chain = pendulum.best_chain
-    assert f"cost {pendulum.cost[chain]:.4g}" in lines[1]
+    assert f"cost {pendulum.replay_cost[chain]:.4g} (plan {pendulum.cost[chain]:.4g})" in lines[1]
+    assert "residual not known" in lines[1]
+    assert lines[0] == f"{pendulum.problem.name}: {pendulum.verdict}"
     assert f"max|h| {pendulum.max_defect[chain]:.1g}" in lines[1]
     assert f"{pendulum.success_rate:.0%} of 8 chains" in lines[1]
     for line, replay in zip(

@@ -230,7 +230,7 @@ def test_film_of_a_replay_that_blows_up_stops_there(cartpole: Solution, tmp_path
         (True, True, True, None, "open loop: reaches the goal"),
         (True, False, True, None, "with feedback: reaches the goal"),
         (True, False, False, "no replay succeeds", "with feedback: misses the goal"),
-        (False, True, True, "the plan breaks the dynamics", "open loop: reaches the goal"),
+        (False, True, True, "the plan is infeasible", "open loop: reaches the goal"),
     ],
 )
 def test_overlay_says_what_is_certified(
@@ -248,7 +248,8 @@ def test_overlay_says_what_is_certified(
         assert lines[0] == judged.problem.name
         assert (f"NOT CERTIFIED: {warning}" == lines[1]) == (not judged.certified)
         defect = "1e-06" if feasible else "0.1"
-        assert f"cost {judged.cost[judged.best_chain]:.3g}   max|h| {defect}" in lines
+        assert f"cost {judged.replay_cost[judged.best_chain]:.3g}   max|h| {defect}" in lines
+        assert "residual not known" in lines
         assert "bound violation 0" in lines
         assert f"{lines[-3]} {lines[-2]}".startswith(f"{engine}, {mode}, ")
         assert lines[-1] == "t = {time}"

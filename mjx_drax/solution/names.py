@@ -1,0 +1,59 @@
+"""Names of the entries of states and controls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mjx_drax.physics.dynamics import mujoco_model
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.problem.dynamics import Dynamics
+
+_POSITIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
+}
+_VELOCITIES = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
+}
+
+
+def state_names(dynamics: Dynamics) -> list[str]:
+    """Names of the entries of a state, nx of them.
+
+    For a model qpos_JOINT, qvel_JOINT and act_ACTUATOR, in MuJoCo's units; joints with several
+    coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise x0,
+    x1, ...
+    """
+    model = mujoco_model(dynamics)
+    if model is None:
+        return [f"x{i}" for i in range(dynamics.nx)]
+    return [
+        *_joint_names(model, "qpos", _POSITIONS),
+        *_joint_names(model, "qvel", _VELOCITIES),
+        *_activation_names(model),
+    ]
+
+
+def control_names(dynamics: Dynamics) -> list[str]:
+    """Names of the entries of a control, nu of them: ctrl_ACTUATOR, or u0, u1, ..."""
+    model = mujoco_model(dynamics)
+    if model is None:
+        return [f"u{i}" for i in range(dynamics.nu)]
+    return [f"ctrl_{model.actuator(i).name or i}" for i in range(model.nu)]
+
+
+def _joint_names(
+    model: mujoco.MjModel, kind: str, parts: dict[int, tuple[str, ...]]
+) -> Iterator[str]:
+    for i in range(model.njnt):
+        name = f"{kind}_{model.joint(i).name or i}"
+        for part in parts.get(int(model.jnt_type[i]), ("",)):
+            yield f"{name}_{part}" if part else name
+
+
+def _activation_names(model: mujoco.MjModel) -> Iterator[str]:
+    for i in range(model.nu):
+        name, count = model.actuator(i).name or i, int(model.actuator_actnum[i])
+        for part in range(count):
+            yield f"act_{name}" if count == 1 else f"act_{name}_{part}"

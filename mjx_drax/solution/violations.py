@@ -1,0 +1,417 @@
+"""How far a motion breaks what is asked of it: kind by kind, how much, which entry, at which knot.
+
+A *kind* is the goal, tracking of the plan (where there is no goal), the bounds of states and of
+controls, equality and inequality constraints at the stages and at the end, and the dynamics (of a
+plan; a replay obeys them). A violation is tolerated up to a number in the user's units that
+`Tolerances` gives, or else up to a share of a scale that is the problem's own, so that units do not
+matter. The scales come from the *extent* E of the planned motion, in each coordinate of states and
+controls the distance between its largest and its least value over the knots. A coordinate that
+hardly moves has the extent `STILL` of the box that initial knots are scattered over.
+
+    kind              scale
+    tracking          E
+    bounds            width of the box, at most `WIDE` E; E where a side is infinite
+    constraints g     root mean square of the change of g, where the knot moves by +-E in all
+                      coordinates at once, for random signs; to first order |E dg/dz|
+
+So a constraint is kept, to first order, if moving the knot by the share of the motion's extent
+could mend it. A stage constraint is one of (x_k, u_k), k = 0..K-1, and x_0 is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax.base.errors import DraxError, require_not_negative, shown
+from mjx_drax.base.numbers import numbers
+from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import joined
+from mjx_drax.solution.names import control_names, state_names
+
+GOAL, TRACKING, DYNAMICS = "goal", "tracking", "dynamics"
+
+MEASURED = (
+    TRACKING,
+    "state_bounds",
+    "control_bounds",
+    "equality",
+    "inequality",
+    "terminal_equality",
+    "terminal_inequality",
+)
+"""The kinds that have a tolerance."""
+
+KINDS = (GOAL, *MEASURED, DYNAMICS)
+
+STILL = 1e-2
+"""Least extent, as a share of the width of the scatter box; of 1 where the box has no width."""
+
+WIDE = 10.0
+"""A box that is wider than so many times the motion's extent counts as that wide."""
+
+MOVE, DIRECTIONS = 1e-2, 16
+"""Share of the extent by which knots are moved to see how constraints change, and how often."""
+
+Tolerance = float | Sequence[float] | None
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Which violations of a replay are tolerated, for each kind of requirement.
+
+    Attributes:
+        relative: where a kind has no number of its own: share of the scale that the problem itself
+            gives it, from the box that bounds it or from the size of the motion (`violations`).
+        tracking: without a goal: |x_K - plan| of each coordinate of the tangent space.
+        state_bounds, control_bounds: distance from the box, of each entry.
+        equality, inequality, terminal_equality, terminal_inequality: |h| and positive g, each row.
+
+    All but `relative` are in the user's units: one number, one for each entry, or None.
+
+    Raises:
+        DraxError: what is no number, or below 0.
+    """
+
+    relative: float = 5e-3
+    tracking: Tolerance = None
+    state_bounds: Tolerance = None
+    control_bounds: Tolerance = None
+    equality: Tolerance = None
+    inequality: Tolerance = None
+    terminal_equality: Tolerance = None
+    terminal_inequality: Tolerance = None
+
+    def __post_init__(self) -> None:
+        require_not_negative("relative of the tolerances", self.relative)
+        for kind in MEASURED:
+            value = getattr(self, kind)
+            if value is None:
+                continue
+            try:
+                array = numbers(value)
+            except (TypeError, ValueError):
+                array = np.array(np.nan)
+            if array.ndim > 1 or not (np.isfinite(array) & (array >= 0)).all():
+                raise DraxError(
+                    f"the tolerance of {words(kind)} is {shown(value)}: give a number of at least "
+                    "0 in your units, one for each entry, or None."
+                )
+            plain = array.item() if array.ndim == 0 else tuple(array.tolist())
+            object.__setattr__(self, kind, plain)
+
+    def of(self, problem: Problem) -> tuple[np.ndarray, ...]:
+        """Tolerances of all entries of each kind in `MEASURED`, NaN where they are relative.
+
+        Raises:
+            DraxError: another number of tolerances than the problem has entries.
+        """
+        found = []
+        for kind, entries in zip(MEASURED, _sizes(problem), strict=True):
+            value = getattr(self, kind)
+            given = np.asarray(np.nan if value is None else value, float)
+            if given.ndim and len(given) != entries:
+                raise DraxError(
+                    f"the tolerances of {words(kind)} are {len(given)} numbers: give {entries}, or "
+                    f"one for all entries of {problem.name}."
+                )
+            found.append(np.broadcast_to(given, (entries,)))
+        return tuple(found)
+
+
+def as_tolerances(given: Tolerances | None) -> Tolerances:
+    """The tolerances, the default ones for None.
+
+    Raises:
+        DraxError: they are something else.
+    """
+    if given is None:
+        return Tolerances()
+    if not isinstance(given, Tolerances):
+        raise DraxError(f"tolerances are {shown(given)}: give mjx_drax.Tolerances(...).")
+    return given
+
+
+def _sizes(problem: Problem) -> tuple[int, ...]:
+    """Number of entries of each kind in `MEASURED`."""
+    dynamics, stage, end = problem.dynamics, problem.constraint, problem.terminal_constraint
+    return (
+        dynamics.ndx,
+        dynamics.nx,
+        dynamics.nu,
+        stage.equalities,
+        stage.inequalities,
+        end.equalities,
+        end.inequalities,
+    )
+
+
+def words(kind: str) -> str:
+    """A kind as a text says it."""
+    return kind.replace("_", " ")
+
+
+class Violation(NamedTuple):
+    """One violation: in the user's units, what is tolerated there, which entry, at which knot.
+
+    Entry and knot are -1 where there is none to name, as for a goal.
+    """
+
+    kind: str
+    size: float
+    allowed: float
+    entry: int
+    knot: int
+
+    @property
+    def broken(self) -> bool:
+        """Whether it is more than is tolerated."""
+        return self.size > self.allowed
+
+    @property
+    def ratio(self) -> float:
+        """Its size in multiples of what is tolerated; infinite where nothing is."""
+        return self.size / self.allowed if self.allowed else np.inf * self.size
+
+    def told(self, problem: Problem) -> str:
+        """What is broken, by how much, where and when, in words."""
+        by = f"by {self.size:.1e} (tolerated: {self.allowed:.1e})"
+        if self.kind == GOAL:
+            return "misses the goal"
+        if self.knot < 0:
+            return f"breaks the {words(self.kind)} {by}"
+        at = f"at knot {self.knot}, {problem.times[self.knot]:.3g} s"
+        name = _entry_name(problem, self.kind, self.entry)
+        if self.kind == TRACKING:
+            return f"ends off the plan in {name} {by}"
+        if self.kind.endswith("bounds"):
+            return f"leaves the bounds of {name} {by} {at}"
+        if self.kind == DYNAMICS:
+            return f"breaks the dynamics in {name} {by} {at}"
+        return f"breaks {words(self.kind)} {name} {by} {at}"
+
+    def data(self) -> dict[str, Any]:
+        """As files hold it."""
+        at = {"entry": self.entry, "knot": self.knot} if self.size else {"entry": -1, "knot": -1}
+        return {"size": self.size, "allowed": self.allowed, **at}
+
+
+def _entry_name(problem: Problem, kind: str, entry: int) -> str:
+    """The name of an entry of a state, a control, a difference of states or a constraint."""
+    dynamics = problem.dynamics
+    if kind == "control_bounds":
+        return control_names(dynamics)[entry]
+    if kind == "state_bounds" or (kind in (TRACKING, DYNAMICS) and dynamics.nx == dynamics.ndx):
+        return state_names(dynamics)[entry]
+    return f"coordinate {entry}" if kind in (TRACKING, DYNAMICS) else f"[{entry}]"
+
+
+@dataclass(frozen=True)
+class Violations:
+    """The largest violation of each kind in `KINDS`, for every motion, (motions, kinds) each.
+
+    Largest in multiples of what is tolerated.
+
+    Attributes:
+        size: in the user's units; a goal that is missed has 1, what is not finite infinity.
+        allowed: what is tolerated there; NaN where the problem has nothing of that kind.
+        entry: of the state, control, difference of states, or constraint.
+        knot: k, from 0 to K.
+    """
+
+    size: np.ndarray
+    allowed: np.ndarray
+    entry: np.ndarray
+    knot: np.ndarray
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Whether no kind is broken, (motions,)."""
+        return np.logical_not((self.size > self.allowed).any(axis=1))
+
+    def of(self, motion: int) -> list[Violation]:
+        """Those of one motion, of the kinds that the problem has."""
+        rows = zip(
+            KINDS,
+            *(getattr(self, f.name)[motion].tolist() for f in fields(self)),
+            strict=True,
+        )
+        return [v for v in (Violation(*row) for row in rows) if v.allowed == v.allowed]
+
+    def worst(self, motion: int) -> Violation | None:
+        """The one that is broken most, of one motion; None if all is kept."""
+        broken = [v for v in self.of(motion) if v.broken]
+        return max(broken, key=lambda v: v.ratio) if broken else None
+
+    def data(self, motion: int) -> dict[str, dict[str, Any]]:
+        """Those of one motion as files hold them, by kind."""
+        return {v.kind: v.data() for v in self.of(motion)}
+
+
+def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Range over the knots of planned states (n, nx), their differences (n, ndx), controls (n, nu).
+
+    Args:
+        problem: for its state arithmetic; numbers of its own do not count.
+        plan: x_0..x_K, (n, K + 1, nx).
+        u: controls, (n, K, nu).
+    """
+    moved = problem.dynamics.host_difference(plan, np.broadcast_to(plan[:, :1], plan.shape))
+    with np.errstate(invalid="ignore"):  # of plans that are not finite
+        return tuple(
+            np.nan_to_num(np.ptp(np.asarray(a, float), axis=1), posinf=0.0)
+            for a in (plan, moved, u)
+        )
+
+
+def measured(
+    family: Family,
+    motion: tuple[np.ndarray, np.ndarray],
+    off: np.ndarray,
+    extent: tuple[np.ndarray, ...],
+    tolerances: Tolerances,
+) -> tuple[np.ndarray, Violations]:
+    """Cost (n,) and violations of motions, one of each problem, or all of one problem.
+
+    The goal, which a function on the host decides, and the dynamics count as kept.
+
+    Args:
+        family: the problems.
+        motion: states x_0..x_K (n, K + 1, nx) and controls (n, K, nu).
+        off: x_K - plan, (n, ndx).
+        extent: of the plans, from `extents`.
+        tolerances: what is tolerated.
+    """
+    dtype = family.problem.x_init.dtype
+    limits = tolerances.of(family.at(0)), tolerances.relative
+    given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+    cost, found = _measured(*family.parts, *given)
+    size, allowed, entry, knot = (np.asarray(a) for a in found)
+
+    def framed(values: np.ndarray, filling: float) -> np.ndarray:
+        """With a column for the goal in front, and one for the dynamics at the end."""
+        return np.pad(values.T, ((0, 0), (1, 1)), constant_values=filling)
+
+    size = np.nan_to_num(size.astype(float), nan=np.inf)
+    allowed = allowed.astype(float)
+    return np.asarray(cost), Violations(
+        framed(size, 0.0), framed(allowed, np.nan), framed(entry, -1), framed(knot, -1)
+    )
+
+
+@jax.jit
+@full_precision
+def _measured(
+    own: Problem,
+    shared: Problem,
+    motion: tuple[Array, Array],
+    off: Array,
+    extent: tuple[Array, ...],
+    limits: tuple[tuple[Array, ...], Array],
+) -> tuple[Array, tuple[Array, ...]]:
+    """Cost (n,); size, tolerance, entry and knot of the largest violation, (kinds, n) each."""
+    given, relative = limits
+
+    def of_motion(own: Problem, motion: tuple[Array, Array], off: Array, extent: Any) -> Any:
+        states, u = motion
+        problem = replace(joined(shared, own), x_init=states[0])
+        least = _least_extent(problem)
+        E = tuple(map(jnp.maximum, extent, least))
+        worst = []
+        for (size, scale, first), number in zip(
+            _sizes_and_scales(problem, states, u, off, E), given, strict=True
+        ):
+            allowed = jnp.where(jnp.isnan(number), relative * scale, number)
+            worst.append(_largest(size, jnp.broadcast_to(allowed, size.shape), first))
+        cost = problem.cost(Trajectory(states[1:], u))
+        return cost, tuple(map(jnp.stack, zip(*worst, strict=True)))
+
+    found: Any = jax.vmap(of_motion, out_axes=(0, 1))(own, motion, off, extent)
+    return found
+
+
+def _least_extent(problem: Problem) -> tuple[Array, Array, Array]:
+    """Least extents of states (nx,), their differences (ndx,) and controls (nu,)."""
+    box = problem.scatter
+
+    def least(width: Array) -> Array:
+        return STILL * jnp.where((width > 0) & jnp.isfinite(width), width, 1.0)
+
+    def widest(lower: Array, upper: Array) -> Array:
+        width = jnp.asarray(upper - lower)
+        return width.reshape(-1, width.shape[-1]).max(axis=0)
+
+    x, u = widest(box.x_lower, box.x_upper), widest(box.u_lower, box.u_upper)
+    return least(x), least(problem.dynamics.tangent(x)), least(u)
+
+
+def _sizes_and_scales(
+    problem: Problem, states: Array, u: Array, off: Array, E: tuple[Array, ...]
+) -> Iterator[tuple[Array, Array, int]]:
+    """Sizes (knots, entries), their scales, and the first knot, of each kind in `MEASURED`."""
+    box, K = problem.bounds, len(u)
+    stage, end = problem.constraint, problem.terminal_constraint
+    yield jnp.abs(off)[None], E[1], K
+    yield (*_outside(states[1:], box.x_lower, box.x_upper, E[0]), 1)
+    yield (*_outside(u, box.u_lower, box.u_upper, E[2]), 0)
+    none = jnp.zeros((K, 0)), jnp.zeros(0)
+    values, changes = none, none
+    if stage.rows or end.rows:
+        values, changes = _constraints(problem, states, u, E)
+    for at, (constraint, first) in enumerate(((stage, 0), (end, K))):
+        value, change = (jnp.atleast_2d(part[at]) for part in (values, changes))
+        m = constraint.equalities
+        yield jnp.abs(value[:, :m]), change[:, :m], first
+        yield jnp.maximum(value[:, m:], 0.0), change[:, m:], first
+
+
+def _outside(z: Array, lower: Array, upper: Array, E: Array) -> tuple[Array, Array]:
+    """Distances of knots (K, n) from a box, and their scales; NaN where there is no bound."""
+    width = upper - lower
+    scale = jnp.where(jnp.isfinite(width), jnp.minimum(width, WIDE * E), E)
+    free = jnp.isinf(lower) & jnp.isinf(upper)
+    size = jnp.maximum(lower - z, z - upper)
+    return jnp.maximum(size, 0.0), jnp.where(free, jnp.nan, scale)
+
+
+def _constraints(
+    problem: Problem, states: Array, u: Array, E: tuple[Array, ...]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Constraints at the stages (K, m) and at the end (m_end,), and how much they change."""
+    ndx = problem.dynamics.ndx
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (DIRECTIONS, ndx + u.shape[-1]))
+    steps = jnp.asarray(np.vstack([0.0 * signs[:1], signs])) * jnp.concatenate([E[1], E[2]]) * MOVE
+
+    def values(step: Array) -> tuple[Array, Array]:
+        dx, du = step[:ndx], step[ndx:]
+        moved = jax.vmap(lambda x: problem.dynamics.integrate(x, dx))(states)
+        stages = jax.vmap(problem.running_constraint)(moved[:-1], u + du)
+        return stages, problem.end_constraint(moved[-1])
+
+    # One after the other: all at once would take sixteen times the memory
+    found = jax.lax.map(values, steps)
+
+    def change(values: Array) -> Array:
+        return jnp.sqrt(jnp.square(jnp.nan_to_num(values[1:] - values[0])).mean(axis=0)) / MOVE
+
+    return jax.tree.map(lambda a: a[0], found), jax.tree.map(change, found)
+
+
+def _largest(size: Array, allowed: Array, first: int) -> tuple[Array, Array, Array, Array]:
+    """The largest of sizes (knots, entries) in multiples of what is allowed, and where it is."""
+    if size.size == 0:
+        return jnp.zeros(()), jnp.full((), jnp.nan), jnp.int32(-1), jnp.int32(-1)
+    ratio = jnp.where(size > 0, size / jnp.maximum(allowed, jnp.finfo(size.dtype).tiny), 0.0)
+    ratio = jnp.where(jnp.isnan(size), jnp.inf, ratio)
+    at = jnp.argmax(jnp.where(jnp.isnan(allowed), -1.0, ratio))
+    knot, entry = jnp.divmod(at, size.shape[1])
+    return size.ravel()[at], allowed.ravel()[at], entry, knot + first
