@@ -347,8 +347,7 @@ def _least_extent(problem: Problem) -> tuple[Array, Array, Array]:
         return STILL * jnp.where((width > 0) & jnp.isfinite(width), width, 1.0)
 
     def widest(lower: Array, upper: Array) -> Array:
-        width = jnp.asarray(upper - lower)
-        return width.reshape(-1, width.shape[-1]).max(axis=0)
+        return jnp.atleast_2d(upper - lower).max(axis=0)
 
     x, u = widest(box.x_lower, box.x_upper), widest(box.u_lower, box.u_upper)
     return least(x), least(problem.dynamics.tangent(x)), least(u)

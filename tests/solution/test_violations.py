@@ -1,0 +1,337 @@
+"""What a replay breaks: how much, which entry, at which knot; what is tolerated, in any units."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import made_up, point
+from jax.tree_util import Partial
+
+from mjx_drax import (
+    DraxError,
+    Langevin,
+    Solution,
+    Tolerances,
+    Trajectory,
+    from_function,
+    minimize,
+    solve,
+    solve_batch,
+)
+from mjx_drax.cli.summary import lines
+from mjx_drax.problem.problem import Problem
+from mjx_drax.solution.program import from_program
+from mjx_drax.solution.replay import open_loop_is_better, replays
+from mjx_drax.solution.violations import KINDS
+
+K, DT = 10, 0.2
+UNITS = [(1.0, 1.0), (1e3, 1.0), (1e-3, 1e4), (1.0, 1e-6)]
+"""Units of length and of the values of a constraint."""
+
+
+def mass(length=1.0, **rest) -> Problem:
+    """A mass that a force moves along a line; x = (place, speed), in a unit of length."""
+    given = {
+        "x_init": [0.0, 0.0],
+        "nu": 1,
+        "dt": DT,
+        "horizon": K * DT,
+        "running_cost": lambda x, u: u @ u,
+        "x_scatter": (-length, length),
+        "u_scatter": (-length, length),
+        "name": "mass",
+    }
+    return from_function(lambda x, u: x + DT * jnp.array([x[1], u[0]]), **{**given, **rest})
+
+
+def motion(length=1.0):
+    """Forces (K, 1) that speed up and slow down, and the states x_0..x_K that they lead to."""
+    u = length * np.repeat([1.0, -1.0], K // 2)[:, None]
+    x = [np.zeros(2)]
+    for force in u[:, 0]:
+        x.append(x[-1] + DT * np.array([x[-1][1], force]))
+    return np.array(x), u
+
+
+def replayed(problem, plan, u, tolerances=None):
+    gains = np.zeros((1, K, 1, 2))
+    return replays(problem, Trajectory(plan[None, 1:], u[None]), gains, tolerances)
+
+
+def violation(found, kind):
+    return found.violations.data(0).get(kind)
+
+
+X, U = motion()
+
+
+def bounds_of_knot_4(x):
+    upper = np.full((K, 2), 9.0)
+    upper[3, 1] = x[4, 1] - 0.3  # rows are x_1..x_K
+    return np.full((K, 2), -9.0), upper
+
+
+# Largest at the last stage, whose state is x_{K-1}, and at the end
+CASES = {
+    "state_bounds": ({"x_bounds": bounds_of_knot_4(X)}, 0.3, 1, 4),
+    "equality": ({"equality": lambda x, u: jnp.array([0.0, x[0]])}, X[K - 1, 0], 1, K - 1),
+    "inequality": (
+        {"inequality": lambda x, u: jnp.array([-1.0, x[1] - 0.6, u[0] - 5.0])},
+        X[5, 1] - 0.6,
+        1,
+        5,
+    ),
+    "terminal_equality": ({"terminal_equality": lambda x: x - X[K] + 0.2}, 0.2, None, K),
+    "terminal_inequality": ({"terminal_inequality": lambda x: x[:1] - 0.5}, X[K, 0] - 0.5, 0, K),
+    "goal": ({"goal": lambda x: x[0] > 99}, 1.0, -1, K),
+}
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_a_replay_that_breaks_what_was_asked_is_no_success(kind):
+    parts, size, entry, knot = CASES[kind]
+    found = replayed(mass(**parts), X, U)
+    assert found.max_deviation[0] < 1e-6  # it is as planned, and yet
+    assert not found.success[0]
+    told = violation(found, kind)
+    assert told["size"] == pytest.approx(size, rel=1e-5)
+    assert told["knot"] == knot
+    assert entry is None or told["entry"] == entry
+    assert told["size"] > told["allowed"]
+    others = [v for v in found.violations.of(0) if v.kind != kind]
+    assert not any(v.broken for v in others)
+    assert found.violations.worst(0).kind == kind
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CASES if kind != "goal"])
+def test_a_tolerance_of_ones_own_is_in_ones_own_units(kind):
+    parts, size, *_ = CASES[kind]
+    problem = mass(**parts)
+    assert replayed(problem, X, U, Tolerances(**{kind: 1.01 * size})).success[0]
+    assert not replayed(problem, X, U, Tolerances(**{kind: 0.99 * size})).success[0]
+    entries = {"state_bounds": 2, "equality": 2, "inequality": 3, "terminal_equality": 2}
+    each = np.full(entries.get(kind, 1), 1.01 * size)
+    assert replayed(problem, X, U, Tolerances(**{kind: each})).success[0]
+
+
+def test_without_a_violation_all_is_kept():
+    problem = mass(
+        x_bounds=(-9, 9),
+        u_bounds=(-1, 1),
+        equality=lambda x, u: jnp.array([u[0] ** 2 - 1.0]),
+        inequality=lambda x, u: x - 3.0,
+        terminal_equality=lambda x: x - X[K],
+    )
+    found = replayed(problem, X, U)
+    assert found.success[0]
+    told = found.violations.data(0)
+    assert set(told) == set(KINDS) - {"goal", "dynamics", "terminal_inequality"}
+    assert all(v["size"] <= 1e-5 for v in told.values())
+
+
+@pytest.mark.parametrize(("length", "unit"), UNITS)
+@pytest.mark.parametrize("over", [0.9, 1.1])
+def test_units_do_not_change_a_verdict(length, unit, over):
+    """A wall that the replay passes by a share of what is tolerated."""
+    states, u = motion(length)
+    share, extent = Tolerances().relative, X[:, 0].max()
+    wall = X[K - 1, 0] - over * share * extent
+    for part, at in (("inequality", "inequality"), ("equality", "equality")):
+        function = Partial(past, jnp.array([length, unit, wall]))
+        found = replayed(mass(length, **{part: function}), states, u)
+        told = violation(found, at)
+        if part == "inequality":
+            assert told["size"] == pytest.approx(over * share * extent * unit, rel=1e-3)
+            assert found.success[0] == (over < 1)
+        # To move the place by its extent changes the constraint by the extent in its unit
+        assert told["allowed"] == pytest.approx(share * extent * unit, rel=1e-3)
+    box = np.array([length * (X[K, 0] - over * share * extent), np.inf])
+    found = replayed(mass(length, x_bounds=(-np.inf, box)), states, u)
+    assert violation(found, "state_bounds")["allowed"] == pytest.approx(share * extent * length)
+    assert found.success[0] == (over < 1)
+
+
+def past(units, x, u):
+    length, unit, wall = units
+    return jnp.array([unit * (x[0] / length - wall)])
+
+
+def test_a_box_tolerates_a_share_of_its_width_unless_it_is_far_wider_than_the_motion():
+    for low, width in ((-1.0, 1.9), (-1e6, 10 * X[:, 0].max())):
+        found = replayed(mass(x_bounds=([low, -np.inf], [0.9, np.inf])), X, U)
+        allowed = violation(found, "state_bounds")["allowed"]
+        assert allowed == pytest.approx(width * Tolerances().relative)
+
+
+@pytest.mark.parametrize("length", [1.0, 0.01, 1e-5, 1e3])
+def test_without_a_goal_a_replay_tracks_its_plan_in_the_size_of_the_motion(length):
+    """As in a plan of 1 cm, of which 9 mm are far too much."""
+    states, u = motion(length)
+    problem = mass(length)
+    for off, success in ((0.9, False), (0.02, False), (1e-4, True)):
+        plan = states.copy()
+        plan[-1, 0] += off * length
+        found = replayed(problem, plan, u)
+        assert found.success[0] == success
+        told = violation(found, "tracking")
+        assert (told["entry"], told["knot"]) == (0, K)
+        assert told["size"] == pytest.approx(off * length, rel=1e-2)
+    wanted = Tolerances(tracking=[0.95 * length, 1e-3 * length])
+    plan = states + np.array([0.9 * length, 0.0]) * (np.arange(K + 1) == K)[:, None]
+    assert replayed(problem, plan, u, wanted).success[0]
+
+
+def test_a_coordinate_that_stands_still_has_the_scale_of_the_scatter():
+    still = np.zeros((K + 1, 2))
+    still[-1, 0] = 1e-5
+    found = replayed(mass(100.0), still, np.zeros((K, 1)))
+    assert found.success[0]
+    still[-1, 0] = 1.0
+    assert not replayed(mass(100.0), still, np.zeros((K, 1))).success[0]
+
+
+def test_a_replay_that_diverges_breaks_what_it_can():
+    problem = mass(x_bounds=(-9, 9), inequality=lambda x, u: x - 5.0)
+    found = replayed(problem, X, np.full((K, 1), np.nan))
+    assert not found.success[0]
+    assert violation(found, "inequality")["size"] == np.inf
+    assert found.outcome(problem, 0) == "diverges"
+
+
+@pytest.mark.parametrize(
+    ("tolerances", "words"),
+    [
+        (lambda: Tolerances(relative=-1), "relative of the tolerances is -1"),
+        (lambda: Tolerances(equality="tight"), "tolerance of equality is 'tight'"),
+        (lambda: Tolerances(state_bounds=-1e-3), "tolerance of state bounds is -0.001"),
+        (lambda: Tolerances(tracking=[[1.0]]), "tolerance of tracking"),
+        (lambda: solve(mass(), 1, tolerances=1e-3), "tolerances are 0.001: give mjx_drax.Toler"),
+        (
+            lambda: solve(mass(), 1, tolerances=Tolerances(control_bounds=[1.0, 2.0])),
+            "tolerances of control bounds are 2 numbers: give 1, or one for all",
+        ),
+    ],
+)
+def test_tolerances_that_are_refused(tolerances, words):
+    with pytest.raises(DraxError, match=words):
+        tolerances()
+
+
+# Plans, statuses and files.
+
+
+def infeasible(problem, **changes):
+    """A solution of two chains, of which the first breaks something; by how much is given."""
+    return replace(made_up(problem), max_defect=np.array([0.5, 0.0], np.float32), **changes)
+
+
+def test_an_infeasible_plan_says_where_it_breaks_the_dynamics(tmp_path):
+    made = infeasible(point())  # stands still
+    x = made.trajectories.x.copy()
+    x[0, 6:, 1] = 0.5  # from x_7 on: the step from x_6 leads elsewhere
+    made = replace(made, trajectories=Trajectory(x, made.trajectories.u))
+    where = made.where(0)
+    assert (where.kind, where.entry, where.knot) == ("dynamics", 1, 6)
+    assert where.size == pytest.approx(0.5)
+    assert where.told(made.problem) == (
+        "breaks the dynamics in x1 by 5.0e-01 (tolerated: 1.0e-03) at knot 6, 0.6 s"
+    )
+    assert made.where(1) is None
+    assert made.status == ["infeasible", "feasible"]
+    none = replace(made, max_defect=np.ones(2, np.float32))
+    assert "breaks the dynamics in x" in lines(none)[-1]
+    again = Solution.load(none.save(tmp_path))  # without f nobody can tell where
+    assert again.where(0)[1:] == (1.0, 1e-3, -1, -1)
+    assert again.where(0).told(again.problem).startswith("breaks the dynamics by 1.0e+00")
+
+
+def test_an_infeasible_plan_says_which_constraint_it_breaks():
+    problem = point(inequality=lambda x, u: jnp.array([x[0] - 1.0, u[0] - 0.1]))
+    guess = Trajectory(np.zeros((K, 2)), np.where(np.arange(K) == 4, 0.8, 0.0)[:, None] * [1, 0])
+    still = Langevin(iterations=1, tail=0, step_size=0.0)
+    found = solve(problem, chains=1, solver=still, guess=guess)
+    where = found.where(0)
+    assert (where.kind, where.entry, where.knot) == ("inequality", 1, 4)
+    assert where.size == pytest.approx(0.7, rel=1e-3)
+    program = from_program(2, cost=lambda x: x @ x, inequality=lambda x: x[:1] - 3.0)
+    end = minimize(program, chains=1, solver=still, guess=[5.0, 0.0])
+    assert end.status == ["infeasible"]
+    assert (end.where(0).kind, end.where(0).size) == ("inequality", pytest.approx(2.0))
+    assert not end.optimal
+
+
+def test_optimal_is_certified_with_a_small_residual():
+    made = replace(made_up(point(), 4), residual=np.array([1e-6, 1e-2, np.nan, 1e-6]))
+    failed = replace(made.open_loop, success=np.arange(4) < 3)
+    made = replace(made, open_loop=failed, feedback=failed)
+    assert made.optimal_chains.tolist() == [True, False, False, False]
+    assert made.status == ["optimal", "feasible", "feasible", "feasible"]
+    assert made.optimal
+    assert made.verdict == "CERTIFIED and optimal"
+    assert made.optimality == "residual 1.0e-06, below 0.0001"
+    others = replace(made, residual=np.full(4, 1e-2))
+    assert not others.optimal
+    assert others.verdict == "CERTIFIED, not known to be optimal"
+    ended = replace(made, interrupted=True, max_defect=np.array([0.0, 1.0, 0.0, 1.0]))
+    ended = replace(ended, died_at=np.array([-1, -1, -1, 3]))
+    assert ended.status == ["optimal", "interrupted", "feasible", "diverged"]
+
+
+def test_the_replay_that_succeeds_and_is_cheaper_speaks_for_a_chain():
+    made = made_up(point(), 5)
+    states = made.open_loop.states
+    one = replace(
+        made.open_loop,
+        states=states + 1.0,
+        cost=np.array([2.0, 1.0, 9.0, 1.0, np.nan]),
+        success=np.array([True, True, True, False, False]),
+    )
+    other = replace(one, cost=np.array([1.0, 2.0, 1.0, 2.0, 1.0]), states=states + 2.0)
+    other = replace(other, success=np.array([True, True, False, True, False]))
+    made = replace(made, open_loop=one, feedback=other, cost=np.arange(5.0))
+    assert open_loop_is_better(one, other).tolist() == [False, True, True, False, False]
+    assert made.replay_cost.tolist() == [1.0, 1.0, 9.0, 2.0, 1.0]
+    assert made.best_chain == 0  # certified, and the cheapest as replayed
+    assert made.replay_mode == "with feedback"
+    assert (made.replayed[0] == states[0] + 2.0).all()
+    assert made.optima[0].cost == 1.0
+
+
+def test_tolerances_come_back_and_can_be_changed(tmp_path):
+    problem = point(inequality=lambda x, u: u - 0.4)
+    solver = Langevin(iterations=10, tail=20)
+    loose = Tolerances(inequality=5.0, tracking=[1.0, 1.0])
+    found = solve(problem, chains=2, solver=solver, tolerances=loose)
+    again = Solution.load(found.save(tmp_path), problem)
+    assert again.tolerances == loose
+    np.testing.assert_array_equal(again.feedback.violations.size, found.feedback.violations.size)
+    strict = again.certify(Tolerances(inequality=0.0, relative=0.0))
+    assert strict.tolerances.inequality == 0.0
+    assert strict.feedback.success.sum() <= found.feedback.success.sum()
+
+
+def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
+    def limited(limit):
+        return mass(
+            terminal_residual=lambda x: 10 * (x - jnp.array([0.5, 0.0])),
+            inequality=Partial(lambda limit, x, u: u - limit, limit),
+        )
+
+    limits = np.array([2.0, 0.7, 1e-3])  # with the last one it cannot get there: it stays
+    base = limited(jnp.asarray(1.0))
+
+    def make(limit):
+        inequality = Partial(base.constraint.inequality.func, limit)
+        return replace(base, constraint=replace(base.constraint, inequality=inequality))
+
+    found = solve_batch(make, limits, chains=2, solver=Langevin(iterations=20, tail=40))
+    place = KINDS.index("inequality")
+    sizes = found.open_loop.violations.size[:, place]
+    expected = np.maximum(found.open_loop.controls[..., 0] - limits[:, None], 0).max(axis=1)
+    np.testing.assert_allclose(sizes, expected, atol=1e-6)
+    assert found.status == ["feasible" if f else "infeasible" for f in found.feasible]
+    assert np.isnan(found.residual).all()
+    assert not found.optimal.any()
+    strict = replace(found, chain_residual=np.zeros_like(found.chain_residual))
+    np.testing.assert_array_equal(strict.optimal, found.certified)
