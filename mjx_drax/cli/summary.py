@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
+from mjx_drax.solution.results import Optimum
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import GOAL, TRACKING, words
 
@@ -41,11 +42,11 @@ def constraints(solution: Solution) -> str:
     """The largest violation of each kind on the best chain's better replay."""
     violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
     told = [
-        f"{words(v.kind)} {v.size:.1e} of {v.allowed:.1e}"
+        f"{words(v.kind)} {v.size:.1e} (tolerated: {v.allowed:.1e})"
         for v in violations
         if v.kind not in (GOAL, TRACKING)
     ]
-    return "largest violations: " + "; ".join(told) if told else "the problem has none"
+    return "largest violations: " + ", ".join(told) if told else "the problem has none"
 
 
 def optima_lines(solution: Solution) -> list[str]:
@@ -64,11 +65,16 @@ def optima_lines(solution: Solution) -> list[str]:
         open_loop, feedback = (outcomes[replay["success"]] for replay in replays)
         table.append(
             f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback:13}  "
-            f"{optimum.residual:.1e}"
+            f"{_residual(optimum)}"
         )
     if len(found) > OPTIMA:
         table.append(f"{'':14} and {len(found) - OPTIMA} more")
     return table
+
+
+def _residual(optimum: Optimum) -> str:
+    known = optimum.residual == optimum.residual  # NaN is not equal to itself
+    return f"{optimum.residual:.1e}" if known else "-"
 
 
 def _advice(solution: Solution) -> str:

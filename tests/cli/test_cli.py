@@ -146,7 +146,7 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     assert status == 1
     out = capsys.readouterr().out
     assert "NOT CERTIFIED" in out
-    assert "constraints    largest violations: control bounds 0.0e+00 of" in out
+    assert "constraints    largest violations: control bounds 0.0e+00 (tolerated: 1.0e-02)" in out
     assert "optimality     residual not known" in out
     assert "there from an earlier solve: replay.csv\n" in out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]

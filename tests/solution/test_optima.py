@@ -271,9 +271,9 @@ def test_table_tells_cost_share_and_replays(hill):
     for rank, line in enumerate((first, second), 1):
         optimum = hill.optima[rank - 1]
         assert line.split()[:3] == [str(rank), f"{optimum.cost:.5g}", f"{optimum.share:.1%}"]
-        assert " ".join(line.split()[3:]) == "reaches goal reaches goal nan"
+        assert " ".join(line.split()[3:]) == "reaches goal reaches goal -"
     lost = replace(hill, open_loop=replace(hill.open_loop, success=np.zeros(16, bool)))
-    assert " ".join(optima_lines(lost)[1].split()[3:]) == "fails reaches goal nan"
+    assert " ".join(optima_lines(lost)[1].split()[3:]) == "fails reaches goal -"
 
 
 def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
