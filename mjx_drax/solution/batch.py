@@ -30,10 +30,12 @@ from mjx_drax.solution.replay import (
     WITH_FEEDBACK,
     Replays,
     both_ways,
+    largest_defect,
     open_loop_is_better,
+    plan_violations,
 )
 from mjx_drax.solution.results import RESIDUAL, statuses
-from mjx_drax.solution.violations import Tolerances, as_tolerances
+from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
@@ -123,6 +125,15 @@ class BatchSolution:
         """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, of every problem."""
         finite = np.isfinite(self.x).all(axis=(1, 2)) & np.isfinite(self.u).all(axis=(1, 2))
         return statuses(self.feasible, self.optimal, ~finite, self.interrupted)
+
+    def where(self, i: int) -> Violation | None:
+        """What keeps the plan of problem i from being feasible; see `Solution.where`."""
+        if self.feasible[i]:
+            return None
+        problem, plan, u = self.family.at(i), self.x[i].astype(float), self.u[i]
+        found = plan_violations(Family.of_one(problem), plan[None], u[None]).of(0)
+        broken = [v for v in found if "equality" in v.kind]
+        return max([*broken, largest_defect(problem, plan, u)], key=lambda v: v.size)
 
     @property
     def open_loop_is_better(self) -> np.ndarray:
@@ -219,7 +230,7 @@ def _certified(
         gains=gains,
         chain_cost=cost,
         chain_defect=defect,
-        chain_residual=np.full(shape, np.nan),
+        chain_residual=np.reshape(info.residual, shape),
         tolerance=RESIDUAL,
         best=best,
         interrupted=interrupted,

@@ -199,7 +199,7 @@ def minimize(
         inequality=multipliers[:, rows:],
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
-        residual=np.full(chains, np.nan),
+        residual=np.asarray(info.residual),
         tolerance=RESIDUAL,
         died_at=np.asarray(state.died_at),
         interrupted=search.stage.place < len(search.stage.todo),

@@ -121,7 +121,7 @@ def _certified(
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
         max_violation=np.asarray(info.max_violation),
-        residual=np.full(len(gains), np.nan),
+        residual=np.asarray(info.residual),
         tolerance=RESIDUAL,
         feasible_since=np.where(np.asarray(state.died_at) < 0, found.chains.feasible_since, -1),
         died_at=np.asarray(state.died_at),

@@ -388,7 +388,8 @@ def _constraints(
     """Constraints at the stages (K, m) and at the end (m_end,), and how much they change."""
     ndx = problem.dynamics.ndx
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (DIRECTIONS, ndx + u.shape[-1]))
-    steps = jnp.asarray(np.vstack([0.0 * signs[:1], signs])) * jnp.concatenate([E[1], E[2]]) * MOVE
+    with_none = jnp.asarray(np.vstack([0.0 * signs[:1], signs]), states.dtype)
+    steps = with_none * jnp.concatenate([E[1], E[2]]) * MOVE
 
     def values(step: Array) -> tuple[Array, Array]:
         dx, du = step[:ndx], step[ndx:]

@@ -161,6 +161,8 @@ def ours(
         chains,
         iterations=solution.iterations,
         certified=solution.certified,
+        optimal=solution.optimal,
+        residual=float(solution.residual[best]),
         best_cost=float(solution.replay_cost[best]),
         max_defect=float(solution.max_defect[best]),
         evaluations=evaluations(solver, problem, chains, solution.iterations),

@@ -135,6 +135,7 @@ def test_ctrl_c_keeps_what_there_is(whole, chunks):
 
     found = solve_batch(from_start, STARTS, 3, solver=SOLVER, chunk=2, progress=interrupt)
     np.testing.assert_array_equal(found.certified, solved)
+    assert found.status == ["feasible" if s else "interrupted" for s in solved]
     np.testing.assert_allclose(found.u[solved], whole.u[solved], 1e-4, 1e-4)
     np.testing.assert_allclose(found.chain_cost[solved], whole.chain_cost[solved], 1e-4, 1e-4)
     assert (found.cost[~solved] == np.inf).all()

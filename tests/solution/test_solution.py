@@ -110,7 +110,8 @@ def test_certificate_tells_what_the_best_chain_did(pendulum):
         assert found.states.dtype == np.float64
     states, controls = pendulum.replayed
     better = pendulum.replays_in(pendulum.replay_mode)
-    assert better.cost[c] == min(pendulum.open_loop.cost[c], pendulum.feedback.cost[c])
+    cheaper = min(pendulum.open_loop.cost[c], pendulum.feedback.cost[c])
+    assert better.cost[c] == pytest.approx(cheaper, rel=1e-5)  # of two that are alike, either
     assert better.cost[c] == pendulum.replay_cost[pendulum.certified_chains].min()
     np.testing.assert_array_equal(states, better.states[c])
     np.testing.assert_array_equal(controls, better.controls[c])

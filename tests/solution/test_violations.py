@@ -331,6 +331,13 @@ def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
     expected = np.maximum(found.open_loop.controls[..., 0] - limits[:, None], 0).max(axis=1)
     np.testing.assert_allclose(sizes, expected, atol=1e-6)
     assert found.status == ["feasible" if f else "infeasible" for f in found.feasible]
+    away = replace(found, x=found.x.copy(), chain_defect=np.ones_like(found.chain_defect))
+    away.x[0, 4:, 0] += 7.0
+    where = away.where(0)
+    assert (where.kind, where.entry, where.knot) == ("dynamics", 0, 3)
+    assert where.size == pytest.approx(7.0, rel=1e-3)
+    assert found.feasible[0]
+    assert found.where(0) is None
     assert np.isnan(found.residual).all()
     assert not found.optimal.any()
     strict = replace(found, chain_residual=np.zeros_like(found.chain_residual))
