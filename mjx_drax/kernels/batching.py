@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
 
@@ -17,6 +18,11 @@ from jax.custom_batching import custom_vmap
 def on_gpu() -> bool:
     """Whether programs run on a GPU by default."""
     return jax.default_backend() == "gpu"
+
+
+def of_one_precision(arrays: Sequence[Any]) -> bool:
+    """Whether all arrays are of float32, or all of float64: what kernels work on."""
+    return {array.dtype for array in arrays} in ({np.dtype("f4")}, {np.dtype("f8")})
 
 
 def merged_vmaps(

@@ -19,7 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mjx_drax.kernels.batching import merged_vmaps, on_gpu, padded, repeated, thread_for_each_row
+from mjx_drax.kernels.batching import (
+    merged_vmaps,
+    of_one_precision,
+    on_gpu,
+    padded,
+    repeated,
+    thread_for_each_row,
+)
 from mjx_drax.kernels.small_matrices import (
     Matrix,
     Vector,
@@ -44,8 +51,8 @@ MAX_NDX, MAX_NU = 6, 4
 def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
     """Decorator of the Newton step of one chain, whose vmap is one kernel where that pays.
 
-    That is on GPUs, in float32, for blocks of at most MAX_NDX and MAX_NU. The arrays of the step's
-    arguments are, in their order, those of `newton_steps`; it returns
+    That is on GPUs, in one precision, for blocks of at most MAX_NDX and MAX_NU. The arrays of the
+    step's arguments are, in their order, those of `newton_steps`; it returns
     result(dx=, du=, nx=, nu=, rate=, K=).
     """
 
@@ -69,8 +76,8 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
 def _fits(A: Array, B: Array, *rest: Array) -> bool:
     """Whether the kernel is made for such blocks."""
     ndx, nu = B.shape[-2:]
-    single = all(array.dtype == jnp.float32 for array in (A, B, *rest))
-    return single and 0 < ndx <= MAX_NDX and 0 < nu <= MAX_NU
+    small = 0 < ndx <= MAX_NDX and 0 < nu <= MAX_NU
+    return small and of_one_precision((A, B, *rest))
 
 
 def newton_steps(

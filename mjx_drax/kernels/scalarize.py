@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
-from mjx_drax.kernels.batching import on_gpu
+from mjx_drax.kernels.batching import of_one_precision, on_gpu
 from mjx_drax.kernels.pruning import needed_program, without_unused
 from mjx_drax.kernels.scalar_arithmetic import (
     ELEMENTWISE,
@@ -114,10 +114,11 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
         found.update(zip(keys, scalars, strict=True))
         return [scalar for scalar in found.values() if not is_known(scalar)]
 
-    dtype, entries = np.dtype(np.float32), sum(number.size for number in read)
+    entries = sum(number.size for number in read)
     avals: list[Any] = [*(number.aval for number in read), *program.out_avals]
-    if not read or any(a.dtype != dtype for a in avals) or entries > limit:
+    if not read or not of_one_precision(avals) or entries > limit:
         return in_operations(limit, program, inputs)
+    dtype = avals[0].dtype
     scalars = jax.make_jaxpr(in_scalars)(*[jax.ShapeDtypeStruct((), dtype)] * entries)
     plain = all(equation.primitive.name in IN_KERNELS for equation in scalars.eqns)
     if not (plain and scalars.out_avals):
