@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.engine import Rollout, mujoco
 from mjx_drax.physics.joints import Joints
-from mjx_drax.physics.mjx_model import has_constraints, kept_contacts
+from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.physics.states import difference, integrate, quiet, set_state
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
@@ -227,6 +227,20 @@ class MjxDynamics(Dynamics):
     def step_differentiator(self, by: Any) -> Any:
         """The model's own `derivatives`, if given; no scalars where f holds the contact solver."""
         return self.derivatives or (by if self.kinked else self.differentiator(by))
+
+    def in_float64(self) -> MjxDynamics:
+        """The same with the C engine's numbers, wherever the model has them rounded to float32."""
+        with jax.enable_x64(True):
+            bounded = self.mj_model.jnt_limited != np.asarray(self.model.jnt_limited)
+            exact = put_model(self.mj_model, self.contacts, bounded)
+
+            def unrounded(own: Any, leaf: Any) -> Any:
+                own, leaf = np.asarray(own), np.asarray(leaf)
+                if own.dtype.kind != "f" or own.shape != leaf.shape:
+                    return own
+                return np.where(own == leaf.astype(own.dtype), leaf, own.astype(float))
+
+            return replace(self, model=jax.tree.map(unrounded, self.model, exact))
 
     def fingerprint(self) -> bytes:
         """The model of the C engine."""

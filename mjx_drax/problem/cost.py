@@ -16,6 +16,7 @@ from jax.tree_util import Partial
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.kernels.linalg import transposed_product
 from mjx_drax.problem.differentiators import Differentiator, positive_part
+from mjx_drax.problem.rollout import untraced
 from mjx_drax.problem.tracing import traced
 
 
@@ -44,6 +45,13 @@ def _call_of(cls: type) -> Callable[..., Any]:
     return call
 
 
+def in_float64(function: Partial | None) -> Partial | None:
+    """The same function, none of whose constants JAX has seen in float32."""
+    if function is None:
+        return None
+    return Partial(untraced(function.func), *function.args, **function.keywords)
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Cost:
@@ -64,6 +72,10 @@ class Cost:
         if self.residual is not None:
             total = total + 0.5 * jnp.sum(jnp.square(self.residual(*arguments)))
         return total
+
+    def in_float64(self) -> Cost:
+        """The same cost for float64; see `Problem.in_float64`."""
+        return Cost(in_float64(self.scalar), in_float64(self.residual))
 
     def expand(
         self, at: Callable[[Array], tuple[Any, ...]], size: int, by: Differentiator, key: Array
@@ -106,6 +118,11 @@ class Constraint:
         """Both parts in one vector, (equalities + inequalities,)."""
         parts = [p for p in (self.equality, self.inequality) if p is not None]
         return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
+
+    def in_float64(self) -> Constraint:
+        """The same constraint for float64; see `Problem.in_float64`."""
+        parts = in_float64(self.equality), in_float64(self.inequality)
+        return Constraint(*parts, self.equalities, self.inequalities)
 
     @property
     def rows(self) -> int:

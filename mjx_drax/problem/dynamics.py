@@ -86,7 +86,10 @@ class Dynamics:
         return by
 
     def in_float64(self) -> Any:
-        """The same system, for replays in float64: own functions must not have been traced yet."""
+        """The same system, for float64: own functions must not have been traced in float32.
+
+        Its numbers may stay in float32; who asks for this makes them float64.
+        """
         return self
 
     @property

@@ -21,10 +21,11 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, reason, require_whole, shown
 from mjx_drax.base.numbers import vector
-from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass
+from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass, with_host_fields
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.cost import Constraint, Cost
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.rollout import in_double
 from mjx_drax.problem.tracing import require_shape
 from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory, Values
 
@@ -188,7 +189,8 @@ class Problem:
         """
         if self.guess is not None:
             knots = self.guess(key)
-            return replace(knots, x=self.dynamics.valid(jnp.asarray(knots.x)))
+            x, u = (jnp.asarray(part, self.x_init.dtype) for part in (knots.x, knots.u))
+            return replace(knots, x=self.dynamics.valid(x), u=u)
         key_x, key_u = jax.random.split(key)
         box, dynamics = self.scatter, self.dynamics
         x = jax.random.uniform(key_x, (self.horizon, dynamics.nx))
@@ -237,6 +239,26 @@ class Problem:
                 "value."
             )
         return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
+
+    def in_float64(self) -> Problem:
+        """The same problem in float64, for use under `jax.enable_x64(True)`.
+
+        Numbers that were rounded to float32 stay so, except for those of a MuJoCo model. Functions
+        are copied, since JAX keeps the precision in which it first saw their constant arrays; those
+        of a `Dynamics` of your own are not. A problem that is built under `jax_enable_x64` has
+        no such limits.
+        """
+        with jax.enable_x64(True):
+            own = replace(
+                self,
+                dynamics=self.dynamics.in_float64(),
+                running=self.running.in_float64(),
+                terminal=self.terminal.in_float64(),
+                constraint=self.constraint.in_float64(),
+                terminal_constraint=self.terminal_constraint.in_float64(),
+            )
+            numbers = jax.tree.map(lambda leaf: jnp.asarray(in_double(leaf)), own)
+        return with_host_fields(numbers, own)
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:
         """The same problem from another initial state (nx,).

@@ -27,7 +27,7 @@ def replay(
     """`Dynamics.replay`, by f."""
     with jax.enable_x64(True):
         step, difference, own = _in_float64(dynamics, "step", "difference")
-        ran = _replay(step, difference, own, *jax.tree.map(_double, (plan, u, gains, limits)))
+        ran = _replay(step, difference, own, *jax.tree.map(in_double, (plan, u, gains, limits)))
         return np.asarray(ran[0]), np.asarray(ran[1])
 
 
@@ -37,7 +37,7 @@ def apply(dynamics: Any, name: str, *arrays: np.ndarray) -> np.ndarray:
     rows = [np.broadcast_to(a, (*leading, a.shape[-1])).reshape(-1, a.shape[-1]) for a in arrays]
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         method, own = _in_float64(dynamics, name)
-        out = np.asarray(_apply(method, own, *map(_double, rows)))
+        out = np.asarray(_apply(method, own, *map(in_double, rows)))
     return out.reshape(*leading, -1)
 
 
@@ -45,7 +45,7 @@ def _in_float64(dynamics: Any, *names: str) -> tuple[Any, ...]:
     """Methods of the dynamics as functions of it, and the dynamics, with numbers in float64."""
     own = dynamics.in_float64()
     methods = [untraced(getattr(type(own), name)) for name in names]
-    return *methods, jax.tree.map(_double, own)
+    return *methods, jax.tree.map(in_double, own)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -78,7 +78,7 @@ def _replay(
     return jax.vmap(chain)(plan, u, gains)
 
 
-def _double(leaf: Any) -> Any:
+def in_double(leaf: Any) -> Any:
     """The same number or array in float64, if it is one of floats."""
     array = np.asarray(leaf)
     return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else leaf

@@ -3,6 +3,7 @@
 Few models that have many features each, because every one is compiled.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -16,6 +17,16 @@ from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.model import linearize
 from mjx_drax.physics.states import Engine, difference
 from mjx_drax.problem.trajectory import Trajectory
+
+SWINGING = """
+<mujoco model="swinging">
+  <worldbody>
+    <body><joint name="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.7" size="0.03" mass="0.3"/></body>
+  </worldbody>
+  <actuator><motor joint="hinge" gear="0.7"/></actuator>
+</mujoco>
+"""
 
 FLOATING = """
 <mujoco model="floating">
@@ -252,3 +263,22 @@ def test_smoothed_derivatives_feel_a_contact_from_afar():
         felt.append(float(model.A[0, 1, 0]))  # of the velocity by the height
     assert felt[0] == 0.0
     assert felt[1] < -0.1
+
+
+def test_float64_has_the_c_engines_numbers_and_changed_ones():
+    """A problem built in float32 steps as the C engine does; a mass that was changed stays."""
+    problem = from_mjcf(SWINGING, horizon=0.1, terminal_residual=lambda data: data.qpos)
+    jax.jit(problem.dynamics.step)(problem.x_init, jnp.ones(1))  # in float32, before
+    exact = problem.in_float64()
+    assert exact.dynamics.mj_model is problem.dynamics.mj_model
+    engine = Engine(problem.dynamics.mj_model)
+    x, u = np.array([0.3, -0.7]), np.array([0.9])
+    with jax.enable_x64(True):
+        found = np.asarray(jax.jit(exact.dynamics.step)(x, u))
+    np.testing.assert_allclose(
+        found, engine.step(x, u, exact.dynamics.substeps), rtol=0, atol=1e-14
+    )
+    model = problem.dynamics.model
+    heavier = replace(problem.dynamics, model=model.replace(body_mass=1.5 * model.body_mass))
+    masses = np.asarray(heavier.in_float64().model.body_mass)
+    np.testing.assert_allclose(masses, 1.5 * problem.dynamics.mj_model.body_mass, rtol=1e-7)

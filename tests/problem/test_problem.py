@@ -1,14 +1,17 @@
 """Problems from functions: what is refused, and where initial knots are scattered."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import Partial
 
 from mjx_drax import (
     LBFGS,
     Constant,
     DraxError,
     Langevin,
+    Trajectory,
     from_function,
     from_program,
     minimize,
@@ -88,3 +91,33 @@ def test_lbfgs_is_a_method_of_multipliers():
     found = minimize(program, chains=16, solver=solver)
     assert np.median(found.max_defect) < 1e-4
     assert min(abs(found.best[0] - a) for a in stationary) < 1e-2
+
+
+def test_float64_keeps_no_rounding_of_functions_that_ran_in_float32():
+    """JAX keeps constant arrays in the precision in which it first saw them."""
+    third = np.array([1 / 3])
+    problem = from_function(
+        lambda x, u: x * third,
+        x_init=[1.0],
+        nu=1,
+        dt=0.1,
+        horizon=0.2,
+        running_residual=lambda x, u: jnp.sqrt(2 * third) * x,
+        terminal_cost=Partial(lambda a, x: a * jnp.sum(x * third), 0.5),
+        equality=lambda x, u: x - third,
+        terminal_inequality=lambda x: x - third,
+        goal=lambda x: True,
+        guess=lambda key: Trajectory(np.zeros((2, 1), np.float32), np.zeros((2, 1), np.float32)),
+    )
+    ones = Trajectory(jnp.ones((2, 1)), jnp.ones((2, 1)))
+    assert {leaf.dtype for leaf in jax.tree.leaves(problem.values(ones))} == {np.dtype("f4")}
+    exact = problem.in_float64()
+    with jax.enable_x64(True):
+        values = exact.values(jax.tree.map(lambda a: np.ones(a.shape), ones))
+        assert exact.draw(jax.random.key(0)).u.dtype == np.float64
+    assert {leaf.dtype for leaf in jax.tree.leaves(values)} == {np.dtype("f8")}
+    np.testing.assert_allclose(values.costs, [1 / 3, 1 / 3, 1 / 6], rtol=1e-15)
+    np.testing.assert_allclose(values.defects, -2 / 3, rtol=1e-15)
+    np.testing.assert_allclose(values.constraints.stage, 2 / 3, rtol=1e-15)
+    np.testing.assert_allclose(values.constraints.terminal, 2 / 3, rtol=1e-15)
+    assert (exact.name, exact.goal, exact.guess) == (problem.name, problem.goal, problem.guess)
