@@ -246,6 +246,14 @@ def test_rows_of_a_batch_are_those_of_single_calls(inner, outer, strictly, on_gp
     assert "custom_vmap" in str(jax.make_jaxpr(scalarized(pulled, outermost=True))(*single))
 
 
+def test_kernels_serve_float64_and_no_mixture(strictly, on_gpu):
+    with jax.enable_x64(True):
+        for kinds, served in (("ddd", True), ("fdf", False)):
+            inputs = [np.ones(2, kind) for kind in kinds]
+            program = str(jax.make_jaxpr(scalarized(pulled, outermost=True))(*inputs))
+            assert ("custom_vmap" in program) is served
+
+
 def test_kernels_write_each_number_once_and_none_that_is_known(strictly, on_gpu, monkeypatch):
     written, as_kernel = set(), scalarize.vmapped_as_kernel
 
