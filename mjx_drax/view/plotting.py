@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -173,7 +174,7 @@ def _title(solution: Solution) -> str:
             f"max|h| {solution.max_defect[chain]:.1g},  {solution.optimality},  "
             f"{solution.success_rate:.0%} of {solution.chains} chains succeed",
             *(
-                f"{certificate.engine}, {mode}: {solution.outcome(mode)}"
+                fill(f"{certificate.engine}, {mode}: {solution.outcome(mode)}", 110)
                 for mode in (OPEN_LOOP, WITH_FEEDBACK)
             ),
         ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Generator, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from mjx_drax.view.drawing import Draw
 
 _HOLD = 0.5  # [s] the last frame stays this long
+_WIDTH = 44  # of a line of text [characters]
 
 
 def render(
@@ -179,7 +181,7 @@ def outcome_lines(solution: Solution) -> list[str]:
         f"bound violation {violation:.1g}",
         solution.optimality,
         f"{'MuJoCo C replay' if has_model else 'float64 rollout'}, {mode}:",
-        solution.outcome(mode),
+        *wrap(solution.outcome(mode), _WIDTH),
         "t = {time}",
     ]
     if not solution.certified:

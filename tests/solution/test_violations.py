@@ -1,5 +1,6 @@
 """What a replay breaks: how much, which entry, at which knot; what is tolerated, in any units."""
 
+import json
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -24,6 +25,8 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.program import from_program
 from mjx_drax.solution.replay import open_loop_is_better, replays
 from mjx_drax.solution.violations import KINDS
+from mjx_drax.view import plotting
+from mjx_drax.view.video import outcome_lines
 
 K, DT = 10, 0.2
 UNITS = [(1.0, 1.0), (1e3, 1.0), (1e-3, 1e4), (1.0, 1e-6)]
@@ -259,6 +262,29 @@ def test_an_infeasible_plan_says_which_constraint_it_breaks():
     assert end.status == ["infeasible"]
     assert (end.where(0).kind, end.where(0).size) == ("inequality", pytest.approx(2.0))
     assert not end.optimal
+
+
+def test_a_constraint_that_a_replay_breaks_is_told_everywhere(tmp_path):
+    problem = mass(inequality=lambda x, u: jnp.array([-1.0, x[1] - 0.6]), goal=lambda x: True)
+    found = replayed(problem, X, U)
+    made = replace(made_up(problem, 1), open_loop=found, feedback=found)
+    broken = "breaks inequality [1] by 4.0e-01 (tolerated: 5.0e-03) at knot 5, 1 s"
+    assert not made.certified
+    assert made.outcome("with feedback") == broken
+    assert f"with feedback  {broken}, cost 10" in lines(made)
+    assert "NOT CERTIFIED: feasible chains miss the goal or break" in lines(made)[-1]
+    assert broken in " ".join(outcome_lines(made))
+    assert broken in " ".join(plotting._title(made).split())
+    made.save(tmp_path)
+    told = json.loads((tmp_path / "result.json").read_text())
+    kept = told["certificate"]["feedback"]["violations"]
+    assert kept["goal"] == {"size": 0.0, "allowed": 0.0, "entry": -1, "knot": -1}
+    assert kept["inequality"] == pytest.approx(
+        {"size": 0.4, "allowed": 5e-3, "entry": 1, "knot": 5}, rel=1e-3
+    )
+    assert (told["certified"], told["optimal"], told["residual"]) == (False, False, None)
+    reaches_not = replace(problem, goal=lambda x: False)
+    assert replayed(reaches_not, X, U).outcome(problem, 0) == f"misses the goal and {broken}"
 
 
 def test_optimal_is_certified_with_a_small_residual():
