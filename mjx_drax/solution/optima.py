@@ -47,16 +47,23 @@ LANDMARKS = 512
 """So many are kept, for bounded time; beyond that, chains near none are in no optimum."""
 
 
-def cluster(dynamics: Dynamics, states: ArrayLike, tolerance: float = TOLERANCE) -> np.ndarray:
+def cluster(
+    dynamics: Dynamics,
+    states: ArrayLike,
+    tolerance: float = TOLERANCE,
+    still: ArrayLike = FEASIBLE,
+) -> np.ndarray:
     """Which optimum each motion belongs to, (n,): 0, 1, ... in order of appearance, -1 for none.
 
     Args:
         dynamics: whose `difference` compares states.
         states: x_1..x_K of every motion, cheapest first, (n, K, nx).
         tolerance: distance d within which motions are the same.
+        still: least standard deviation s of a coordinate; what moves by less does not tell motions
+            apart. One number or (ndx,).
     """
     motions = jnp.asarray(states)
-    scale = _spread(dynamics, motions)
+    scale = _spread(dynamics, motions, jnp.asarray(still))
     nearest, group = np.full(len(motions), np.inf), np.full(len(motions), -1)
     found = 0
     for _ in range(LANDMARKS):
@@ -75,14 +82,11 @@ def cluster(dynamics: Dynamics, states: ArrayLike, tolerance: float = TOLERANCE)
 
 
 @jax.jit
-def _spread(dynamics: Dynamics, motions: Array) -> Array:
-    """s (ndx,): standard deviation of each coordinate over motions and knots, (n, K, nx).
-
-    What moves by less than the defects of a feasible chain counts as still.
-    """
+def _spread(dynamics: Dynamics, motions: Array, still: Array) -> Array:
+    """s (ndx,): standard deviation of each coordinate over motions and knots, (n, K, nx)."""
     states = motions.reshape(-1, motions.shape[-1])
     offsets = jax.vmap(dynamics.difference, (0, None))(states, states[0])
-    return jnp.maximum(offsets.std(axis=0), FEASIBLE)
+    return jnp.maximum(offsets.std(axis=0), still)
 
 
 @jax.jit

@@ -35,7 +35,13 @@ from mjx_drax.solution.replay import (
     largest_defect,
     open_loop_is_better,
 )
-from mjx_drax.solution.violations import DYNAMICS, Tolerances, Violation, Violations
+from mjx_drax.solution.violations import (
+    DYNAMICS,
+    Tolerances,
+    Violation,
+    Violations,
+    scatter_widths,
+)
 
 OPTIMAL, FEASIBLE_ONLY, INFEASIBLE = "optimal", "feasible", "infeasible"
 DIVERGED, INTERRUPTED = "diverged", "interrupted"
@@ -311,7 +317,9 @@ def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, 
     if not certified.size:
         return ()
     order = certified[np.argsort(solution.replay_cost[certified], kind="stable")]
-    group = cluster(solution.problem.dynamics, solution.trajectories.x[order], tolerance)
+    problem = solution.problem
+    still = FEASIBLE * scatter_widths(problem)[1]
+    group = cluster(problem.dynamics, solution.trajectories.x[order], tolerance, still)
     return tuple(_optimum(solution, order[group == g]) for g in range(group.max() + 1))
 
 

@@ -324,7 +324,7 @@ def _measured(
     def of_motion(own: Problem, motion: tuple[Array, Array], off: Array, extent: Any) -> Any:
         states, u = motion
         problem = replace(joined(shared, own), x_init=states[0])
-        least = _least_extent(problem)
+        least = (STILL * width for width in scatter_widths(problem))
         E = tuple(map(jnp.maximum, extent, least))
         worst = []
         for (size, scale, first), number in zip(
@@ -339,18 +339,21 @@ def _measured(
     return found
 
 
-def _least_extent(problem: Problem) -> tuple[Array, Array, Array]:
-    """Least extents of states (nx,), their differences (ndx,) and controls (nu,)."""
+def scatter_widths(problem: Problem) -> tuple[Array, Array, Array]:
+    """Widths of the scatter box of states (nx,), their differences (ndx,) and controls (nu,).
+
+    1 where it has none, or an infinite one.
+    """
     box = problem.scatter
 
-    def least(width: Array) -> Array:
-        return STILL * jnp.where((width > 0) & jnp.isfinite(width), width, 1.0)
-
-    def widest(lower: Array, upper: Array) -> Array:
+    def width(lower: Array, upper: Array) -> Array:
         return jnp.atleast_2d(upper - lower).max(axis=0)
 
-    x, u = widest(box.x_lower, box.x_upper), widest(box.u_lower, box.u_upper)
-    return least(x), least(problem.dynamics.tangent(x)), least(u)
+    def usable(width: Array) -> Array:
+        return jnp.where((width > 0) & jnp.isfinite(width), width, 1.0)
+
+    x, u = width(box.x_lower, box.x_upper), width(box.u_lower, box.u_upper)
+    return usable(x), usable(problem.dynamics.tangent(x)), usable(u)
 
 
 def _sizes_and_scales(

@@ -67,6 +67,12 @@ def test_a_coordinate_that_stands_still_does_not_tell_ways_apart():
     assert not cluster(FLAT, motions).any()
 
 
+def test_how_little_is_still_has_the_units_of_the_states():
+    motions = 1e-4 * detour([1.0, -1.0])
+    assert not cluster(FLAT, motions).any()
+    assert cluster(FLAT, motions, still=1e-7).any()
+
+
 def test_a_bridge_over_a_ridge_does_not_join_two_optima():
     sides = np.linspace(1.0, 0.05, 30)  # the farther from both optima, the costlier
     motions = detour(np.ravel(np.stack([sides, -sides], axis=1)))
