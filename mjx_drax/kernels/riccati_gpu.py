@@ -151,17 +151,17 @@ def backward(
     """`method.riccati.factorize` for the chains of a block of threads."""
     *stage_refs, out_ref = refs
     last = end.read(end_ref)
-    mu = last["penalty"][0]
+    soft = 1.0 / last["penalty"][0]
 
     def stage(i: Array, carry: Any) -> Any:
         P, p = carry
         k = horizon - 1 - i
         s = read_all(layouts, stage_refs, k)
         n = range(len(p))
-        Ls = factor([[P[r][c] + mu if r == c else P[r][c] for c in n] for r in n])
-        right = [mu * a + b for a, b in zip(p, matvec(P, s["multiplier"]), strict=True)]
+        Ls = factor([[soft * P[r][c] + (1.0 if r == c else 0.0) for c in n] for r in n])
+        right = [a + soft * b for a, b in zip(p, matvec(P, s["multiplier"]), strict=True)]
         p_relaxed = solve(Ls, right)
-        P_relaxed = symmetric([solve(Ls, [mu * a for a in row]) for row in P])
+        P_relaxed = symmetric([solve(Ls, row) for row in P])
         slope = add(matvec(P_relaxed, s["h"]), p_relaxed)
         A, B = s["A"], s["B"]
         PA, PB = matmul(P_relaxed, A), matmul(P_relaxed, B)
@@ -182,7 +182,8 @@ def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, 
     """`method.riccati.solve_and_sample` for the chains of a block of threads."""
     *stage_refs, out_ref = refs
     last = end.read(end_ref)
-    mu = last["penalty"][0]
+    soft = 1.0 / last["penalty"][0]
+    size = jnp.sqrt(soft)
 
     def stage(k: Array, carry: Any) -> Any:
         dx, nx = carry
@@ -194,13 +195,13 @@ def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, 
 
         du = add(matvec(s["K"], dx), s["kff"])
         y = add(s["h"], after(dx, du))
-        right = [mu * a - b + c for a, b, c in zip(y, s["p"], s["multiplier"], strict=True)]
+        right = [a + soft * (c - b) for a, b, c in zip(y, s["p"], s["multiplier"], strict=True)]
         noise = []
         if nx:
             nu = add(matvec(s["K"], nx), solve_upper(Lu, s["xi_u"], mul))
-            spread = solve(Ls, [mu * a for a in after(nx, nu)])
+            spread = solve(Ls, after(nx, nu))
             kicks = solve_upper(Ls, s["xi_e"], mul)
-            nx = [a - b for a, b in zip(spread, kicks, strict=True)]
+            nx = [a - size * b for a, b in zip(spread, kicks, strict=True)]
             noise = [nx, nu]
         dx = solve(Ls, right)
         costate = add(matvec(full(s["P"]), dx), s["p"])
@@ -209,7 +210,7 @@ def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, 
         return dx, nx
 
     noisy = any("xi_u" in layout.shapes for layout in layouts)
-    zero = [jnp.zeros_like(mu)] * len(last["gx"])
+    zero = [jnp.zeros_like(soft)] * len(last["gx"])
     lax.fori_loop(0, horizon, stage, (zero, zero if noisy else []))
 
 

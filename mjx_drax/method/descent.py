@@ -33,19 +33,22 @@ DAMPING_RANGE = 1e-3, 1e3
 @register_dataclass
 @dataclass(frozen=True)
 class Info:
-    """Diagnostics of a chain: cost, max|h| and bound violation, scalars.
+    """Diagnostics of a chain: cost, max|h|, bound violation and residual, scalars.
 
-    h holds the dynamics' defects and all constraints; inequalities count where positive.
+    h holds the dynamics' defects and all constraints; inequalities count where positive. The
+    residual is that of the polish, and not a number elsewhere.
     """
 
     cost: Array
     max_defect: Array
     max_violation: Array
+    residual: Array
 
 
 def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     """The diagnostics of a trajectory whose functions have these values."""
-    return Info(values.cost, problem.worst(values), problem.bounds.violation(trajectory))
+    outside, unknown = problem.bounds.violation(trajectory), jnp.full((), jnp.nan, trajectory.u.dtype)
+    return Info(values.cost, problem.worst(values), outside, unknown)
 
 
 def line_search(

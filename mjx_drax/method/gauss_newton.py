@@ -66,20 +66,25 @@ class GaussNewton(Metric):
         given = self.state_damping
         of_states = problem.dynamics.state_damping if given is None else given
         cost = _with_barrier(derivatives.cost, *model.barrier, model.weights.damping, of_states)
-        cost, stages, end = _with_constraints(cost, derivatives, model)
+        rows = model.h.constraints
+        penalties = Stagewise(*(mu * jnp.ones(r.shape[-1]) for r in (rows.stage, rows.terminal)))
+        damping = model.weights.damping
+        cost, stages, end = with_constraints(cost, derivatives, model, penalties, damping)
         white, xi = (None, None) if key is None else _white(problem, stages, end, key)
         step = newton(derivatives.dynamics, cost, multipliers.dynamics, mu, white)
         slack = model.gradient.slack
-        ds, rate = jax.vmap(partial(slack_step, penalty=mu))(stages, _stage_steps(step.dx, step.du))
-        ds_end, rate_end = slack_step(end, step.dx[-1], mu)
+        ds, rate = jax.vmap(partial(slack_step, penalty=penalties.stage))(
+            stages, stage_steps(step.dx, step.du)
+        )
+        ds_end, rate_end = slack_step(end, step.dx[-1], penalties.terminal)
         drift = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if slack else None)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
         if xi is None:
             return Direction(drift, None, rates, step.K, memory)
-        ns = jax.vmap(partial(slack_noise, penalty=mu))(
-            stages, _stage_steps(step.nx, step.nu), xi.stage
+        ns = jax.vmap(partial(slack_noise, penalty=penalties.stage))(
+            stages, stage_steps(step.nx, step.nu), xi.stage
         )
-        ns_end = slack_noise(end, step.nx[-1], xi.terminal, mu)
+        ns_end = slack_noise(end, step.nx[-1], xi.terminal, penalties.terminal)
         noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None)
         return Direction(drift, noise, rates, step.K, memory)
 
@@ -98,28 +103,33 @@ class Eliminated:
 def eliminate(
     J: Array, r: Array, multipliers: Array, slope: Array, curvature: Array, penalty: Array
 ) -> tuple[Array, Array, Eliminated]:
-    """Gradient (n,) and Hessian (n, n) of one knot's constraints, slacks (mg,) eliminated."""
+    """Gradient (n,) and Hessian (n, n) of one knot's constraints, slacks (mg,) eliminated.
+
+    The penalty is one for each row, (m,).
+    """
     equalities = r.shape[0] - slope.shape[0]
     force = multipliers + penalty * r
-    D = penalty + curvature
+    of_slack = penalty[equalities:]
+    D = of_slack + curvature
     t = slope + force[equalities:]
     G = J[equalities:]
-    weights = jnp.concatenate([jnp.full(equalities, 1.0) * penalty, penalty * curvature / D])
-    gradient = transposed_product(J, force) - transposed_product(G, penalty * t / D)
+    weights = jnp.concatenate([penalty[:equalities], of_slack * curvature / D])
+    gradient = transposed_product(J, force) - transposed_product(G, of_slack * t / D)
     return gradient, transposed_product(J, weights[:, None] * J), Eliminated(J, r, t, D)
 
 
 def slack_step(block: Eliminated, dz: Array, penalty: Array) -> tuple[Array, Array]:
     """Slack step ds (mg,) and mu (r + J d) (m,), given dz (n,)."""
     equalities = block.r.shape[0] - block.t.shape[0]
-    ds = -(block.t + penalty * (block.J[equalities:] @ dz)) / block.D
+    ds = -(block.t + penalty[equalities:] * (block.J[equalities:] @ dz)) / block.D
     return ds, penalty * (block.r + block.J @ dz).at[equalities:].add(ds)
 
 
 def slack_noise(block: Eliminated, nz: Array, white: Array, penalty: Array) -> Array:
     """Slack noise (mg,), given nz (n,) and standard normal numbers (mg,)."""
-    G = block.J[block.r.shape[0] - block.t.shape[0] :]
-    return -penalty * (G @ nz) / block.D + white / jnp.sqrt(block.D)
+    equalities = block.r.shape[0] - block.t.shape[0]
+    pull = penalty[equalities:] * (block.J[equalities:] @ nz)
+    return -pull / block.D + white / jnp.sqrt(block.D)
 
 
 def _with_barrier(
@@ -141,32 +151,36 @@ def _with_barrier(
     )
 
 
-def _with_constraints(
-    cost: QuadraticCost, derivatives: Derivatives, model: Model
+def with_constraints(
+    cost: QuadraticCost, derivatives: Derivatives, model: Model, penalties: Stagewise, damping: Array
 ) -> tuple[QuadraticCost, Eliminated, Eliminated]:
-    """The cost with the constraints of every stage, and what their slacks are recovered from."""
+    """The cost with the constraints of every stage, and what their slacks are recovered from.
+
+    Penalties are one for each row, (m,) and (m_end,); damping is added to the slacks' curvature.
+    """
     K, ndx = derivatives.dynamics.h.shape
     none = Stagewise(jnp.zeros((K, 0)), jnp.zeros(0))
     slope, curvature = (of_barrier.slack or none for of_barrier in model.barrier)
-    weights, r, nu = model.weights, model.h.constraints, model.multipliers.constraints
+    r, nu = model.h.constraints, model.multipliers.constraints
 
-    def reduce(J: Array, r: Array, nu: Array, b: Array, c: Array) -> Any:
-        return eliminate(J, r, nu, b, c + weights.damping, weights.penalty)
+    def reduce(penalty: Array, J: Array, r: Array, nu: Array, b: Array, c: Array) -> Any:
+        return eliminate(J, r, nu, b, c + damping, penalty)
 
-    g, H, stages = jax.vmap(reduce)(
+    g, H, stages = jax.vmap(partial(reduce, penalties.stage))(
         derivatives.stage, r.stage, nu.stage, slope.stage, curvature.stage
     )
     g_end, H_end, end = reduce(
+        penalties.terminal,
         derivatives.terminal, r.terminal, nu.terminal, slope.terminal, curvature.terminal
     )
-    with_constraints = QuadraticCost(
+    whole = QuadraticCost(
         cost.gx + jnp.concatenate([g[:, :ndx], g_end[None]]),
         cost.gu + g[:, ndx:],
         cost.Hxx + jnp.concatenate([H[:, :ndx, :ndx], H_end[None]]),
         cost.Hux + H[:, ndx:, :ndx],
         cost.Huu + H[:, ndx:, ndx:],
     )
-    return with_constraints, stages, end
+    return whole, stages, end
 
 
 def _white(
@@ -185,7 +199,7 @@ def _white(
     )
 
 
-def _stage_steps(dx: Array, du: Array) -> Array:
+def stage_steps(dx: Array, du: Array) -> Array:
     """(dx_k, du_k) for k = 0..K-1, (K, ndx + nu), from steps of x_1..x_K; dx_0 = 0."""
     before = jnp.concatenate([jnp.zeros_like(dx[:1]), dx[:-1]])
     return jnp.concatenate([before, du], axis=1)

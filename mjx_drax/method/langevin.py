@@ -54,6 +54,7 @@ class State:
         key: random key.
         alive: False from the moment the chain would have turned non-finite.
         died_at: iteration at which it did, or -1.
+        polish: what the polish carries; () without.
     """
 
     trajectory: Trajectory
@@ -64,6 +65,7 @@ class State:
     key: Array
     alive: Array
     died_at: Array
+    polish: Any = ()
 
 
 @register_dataclass
@@ -159,17 +161,11 @@ class Langevin:
         weights, metric = self.weights(self.progress(iteration, noisy)), self.preconditioner
         key = jax.random.fold_in(state.key, iteration)
         compute = (lambda f: f()) if moves is None else partial(where_needed, moves)
-        model = compute(partial(self._model, problem, state, weights, key, tail))
+        model = compute(partial(self.model, problem, state, weights, key, tail))
 
         def diffuse() -> tuple[State, Info]:
-            to = metric.direction(problem, model, key, state.memory)
-            X = self._diffused(problem, state, to, weights, key, tail)
-            new = self._moved(state, X, jnp.asarray(self.step_size), to)
-            if tail:  # for which bounds have multipliers of their own, central at first
-                v = self.bounds.multipliers(problem.bounds, X, weights.barrier)
-                new = replace(new, multipliers=replace(new.multipliers, bounds=v))
             zero = jnp.zeros(())
-            return new, Info(zero, zero, zero)
+            return self.diffuse(problem, state, model, key, tail), Info(zero, zero, zero, zero)
 
         def descend() -> tuple[State, Info]:
             to = compute(lambda: metric.direction(problem, model, None, state.memory))
@@ -181,7 +177,19 @@ class Langevin:
 
         one = diffuse if noise else descend
         new, info = jax.lax.cond(noisy, diffuse, descend) if tail and noise else one()
-        return _keep_finite(state, new, iteration, moves), info
+        return keep_finite(state, new, iteration, moves), info
+
+    def diffuse(
+        self, problem: Problem, state: State, model: Model, key: Array, tail: bool = True
+    ) -> State:
+        """One step with noise, from the model at the chain's knots."""
+        to = self.preconditioner.direction(problem, model, key, state.memory)
+        X = self._diffused(problem, state, to, model.weights, key, tail)
+        new = self._moved(state, X, jnp.asarray(self.step_size), to)
+        if tail:  # for which bounds have multipliers of their own, central at first
+            v = self.bounds.multipliers(problem.bounds, X, model.weights.barrier)
+            new = replace(new, multipliers=replace(new.multipliers, bounds=v))
+        return new
 
     def _moved(self, state: State, X: Trajectory, alpha: Array, to: Direction) -> State:
         """The chain at X, with lambda + alpha r."""
@@ -201,7 +209,7 @@ class Langevin:
         into_tail = (iteration - self.iterations + 1) / jnp.maximum(self.tail, 1)
         return jnp.where(noisy, iteration / jnp.maximum(self.iterations - 1, 1), 1.0 + into_tail)
 
-    def _model(
+    def model(
         self, problem: Problem, state: State, weights: Weights, key: Array, tail: bool
     ) -> Model:
         """The model at the chain's knots. Bounds have multipliers of their own in the tail."""
@@ -226,7 +234,7 @@ class Langevin:
         new = problem.displaced(X, change)
         if not self.adjusted:
             return bounds.confine(problem.bounds, X, new)
-        there = self._model(problem, replace(state, trajectory=new), weights, key, tail)
+        there = self.model(problem, replace(state, trajectory=new), weights, key, tail)
         back = self.preconditioner.direction(problem, there, None, state.memory)
         drifts = to.drift, back.drift
         return descent.metropolis(
@@ -234,7 +242,7 @@ class Langevin:
         )
 
 
-def _keep_finite(old: State, new: State, iteration: Array, moves: Array | None) -> State:
+def keep_finite(old: State, new: State, iteration: Array, moves: Array | None) -> State:
     """The new state; the old one if the chain would turn non-finite, or does not move."""
     names = ("trajectory", "multipliers", "damping", "gains", "memory")
     before, after = ({name: getattr(state, name) for name in names} for state in (old, new))

@@ -88,16 +88,16 @@ class Step:
 def factorize(
     model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array
 ) -> Factorization:
-    """The backward recursion, for multipliers (K, ndx) and penalty mu, a scalar > 0."""
-    identity = jnp.eye(model.A.shape[-1], dtype=model.A.dtype)
+    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, which may be infinite."""
+    soft, identity = 1.0 / penalty, jnp.eye(model.A.shape[-1], dtype=model.A.dtype)
 
     def stage(
         carry: tuple[Array, Array], inputs: tuple[Array, ...]
     ) -> tuple[tuple[Array, Array], Factorization]:
         P, p = carry
         A, B, h, gx, gu, Hxx, Hux, Huu, multiplier = inputs
-        Ls = cholesky(penalty * identity + P)
-        relaxed = solve(Ls, jnp.column_stack([penalty * P, penalty * p + P @ multiplier]))
+        Ls = cholesky(identity + soft * P)
+        relaxed = solve(Ls, jnp.column_stack([P, p + soft * (P @ multiplier)]))
         P_relaxed, p_relaxed = symmetric(relaxed[:, :-1]), relaxed[:, -1]
         slope = P_relaxed @ h + p_relaxed
         PA, PB = P_relaxed @ A, P_relaxed @ B
@@ -133,15 +133,16 @@ def solve_and_sample(
         """F, and the columns f of the step and of the noise."""
         step = model.h + model.B @ factors.kff
         closed = model.A + model.B @ factors.K
-        right = [penalty * closed, penalty * step - factors.p + multiplier]
+        right = [closed, step + soft * (multiplier - factors.p)]
         if white is None:
             out = solve(factors.Ls, jnp.column_stack(right))
             return out[:, :-1], out[:, -1:]
         noise = model.B @ solve_upper(factors.Lu, white.u)
-        out = solve(factors.Ls, jnp.column_stack([*right, penalty * noise]))
-        f_noise = out[:, -1] - solve_upper(factors.Ls, white.e)
+        out = solve(factors.Ls, jnp.column_stack([*right, noise]))
+        f_noise = out[:, -1] - jnp.sqrt(soft) * solve_upper(factors.Ls, white.e)
         return out[:, :-2], jnp.column_stack([out[:, -2], f_noise])
 
+    soft = 1.0 / penalty
     F, f = jax.vmap(affine)(model, factors, multipliers, white)
     after = affine_recursion(F, f)  # dx_1..dx_K since dx_0 = 0
     before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])

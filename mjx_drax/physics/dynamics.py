@@ -133,6 +133,7 @@ class MjxDynamics(Dynamics):
     origin: str | Path | Source | None = field(default=None, metadata=HostOnly)
     structure: Structure = field(init=False)
     checked = True
+    twice = False
 
     def __post_init__(self) -> None:
         """A model that replaces another one, as by `dataclasses.replace`, has its own structure."""

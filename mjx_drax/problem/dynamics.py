@@ -34,6 +34,7 @@ class Dynamics:
         kinked: whether f has kinks, as contacts make them. Then all chains start near x_init, and
             the default solver rolls plans out (`Restarts.rollouts`).
         state_damping: damping of states beside that of controls in `GaussNewton`.
+        twice: whether the polish differentiates f twice; else it learns what curvature f has.
         checked: f has been tried where it was made, and need not be traced once more.
     """
 
@@ -42,6 +43,7 @@ class Dynamics:
     dt: float
     kinked: bool = False
     state_damping: float = 1.0
+    twice: bool = True
     checked: bool = False
 
     @property

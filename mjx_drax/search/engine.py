@@ -27,6 +27,7 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
+from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint, facts
@@ -222,6 +223,12 @@ class Search:
     # Attempts and chunks
 
     @property
+    def polish(self) -> Polish | None:
+        """What follows the noise; None: the flow's tail."""
+        polish = self.settings.polish
+        return polish if polish and polish.iterations else None
+
+    @property
     def indices(self) -> np.ndarray:
         """Problems of the chunk, (size,); the last chunk is filled up with problems again."""
         stage = self.stage
@@ -242,7 +249,7 @@ class Search:
         self._settle(0, indices, scale)
         state = begin(self.question[1], self.question[0], knots, keys)
         zeros: Any = np.zeros(rows, knots.u.dtype)
-        info = Info(zeros, zeros, zeros)
+        info = Info(zeros, zeros, zeros, zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
             _, info = jax.block_until_ready(self._iterated(state, 0, 0))
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
@@ -371,8 +378,10 @@ class Search:
             self.flow = flow
         else:
             self.flow = replace(flow, scale=scale_of(1.0, 1.0))
-        self.question = self.family.question(self.flow, Scale(cost, noise), indices, self.chains)
-        program = partial(iterate, tail=int(flow.tail) > 0)
+        self.question = self.family.question(
+            self.flow, Scale(cost, noise), indices, self.chains, self.polish
+        )
+        program = partial(iterate, tail=settings.after > 0)
         self.launch = spread(program, self.mesh, self.question[0])
 
     # Iterations
@@ -392,7 +401,7 @@ class Search:
                 self.recorder.begin(stage.owners)
             self.stage = replace(stage, began=(*stage.began, (stage.done, stage.done + noisy)))
             self._record()
-        total = flow.iterations + flow.tail
+        total = flow.iterations + self.settings.after
         before = self.stage.done - self.stage.step if self.family.alone else 0
         try:
             while self.stage.step < total:
@@ -407,10 +416,16 @@ class Search:
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 now = Chains(state, info, np.where(feasible, since, -1))
+                if self.question[0].polish is not None and not self._active(state):
+                    total = stop
                 self._report(replace(stage, now=now, step=stop), before + stop)
         except KeyboardInterrupt:  # the chains as they were at the last report
             return False
         return True
+
+    def _active(self, state: State) -> bool:
+        """Whether the polish still moves any chain."""
+        return bool(np.any(gathered(state.polish.active & state.alive, self.mesh)))
 
     def _report_every(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""
@@ -426,7 +441,7 @@ class Search:
         rollouts, stage = self.settings.rollouts, self.stage
         assert rollouts is not None
         total = rollouts.first + rollouts.rounds
-        if total == 0 or self.flow.tail < rollouts.iterations:
+        if total == 0 or self.settings.after < rollouts.iterations:
             return True
         if stage.now.feasible.all() and stage.rollouts == 0:
             return True
@@ -446,7 +461,7 @@ class Search:
             rolled = self._rolled_out(now, float(stage.rollouts > 0), stage.done)
             self.stage = replace(stage, now=best_of(now, rolled, everyone), rollouts=count)
             return
-        done, end = stage.done + iterations, self.flow.iterations + self.flow.tail
+        done, end = stage.done + iterations, self.flow.iterations + self.settings.after
         state = replace(now.state, damping=jnp.asarray(damping, now.state.damping.dtype))
         state, info = self._iterated(state, end - iterations, end)
         found = self._whole(Chains(state, info, np.full(len(everyone), done)))
@@ -515,7 +530,8 @@ class Search:
         problem, rows = family.problem, self.size * self.chains
         nx, nu, dtype = problem.dynamics.nx, problem.dynamics.nu, problem.x_init.dtype
         ones = Scale(np.ones(self.size), np.ones(self.size))
-        shared, own = family.question(settings.flow, ones, np.zeros(self.size, int), self.chains)
+        none = np.zeros(self.size, int)
+        shared, own = family.question(settings.flow, ones, none, self.chains, self.polish)
 
         def state() -> State:
             x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))
@@ -541,7 +557,7 @@ class Search:
         checkpoint, stage = self.checkpoint, self.stage
         if checkpoint is None:
             return 0.0, False
-        state, tail = stage.now.state, int(self.flow.tail) > 0
+        state, tail = stage.now.state, self.settings.after > 0
         checkpoint.require({"initial knots": digest(state.trajectory)})
         program = iterate.lower((state, self.question[1]), self.question[0], 0, 0, tail)
         checkpoint.require({"functions": digest(program.as_text())})

@@ -15,6 +15,7 @@ from mjx_drax.base.errors import DraxError, reason, shown
 from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Scale
+from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import plain
 from mjx_drax.search.iterate import Question, partition
@@ -161,7 +162,12 @@ class Family:
         return self._changed(lambda leaf: leaf[which])
 
     def question(
-        self, flow: Langevin, scale: Scale, indices: np.ndarray, chains: int
+        self,
+        flow: Langevin,
+        scale: Scale,
+        indices: np.ndarray,
+        chains: int,
+        polish: Polish | None = None,
     ) -> tuple[Question, Question]:
         """What the chains of those problems share, and what each has of its own.
 
@@ -170,14 +176,16 @@ class Family:
             scale: cost and noise of each problem, (len(indices),).
             indices: of the problems.
             chains: of each problem.
+            polish: what follows the noise, if anything but the flow's tail.
         """
         if self.alone:
-            return partition(Question(flow, self.problem), None)
+            return partition(Question(flow, self.problem, polish=polish), None)
         each = Scale(*(np.repeat(np.asarray(s), chains) for s in (scale.cost, scale.noise)))
-        whole = Question(replace(flow, scale=each), self.rows(indices, chains))
+        whole = Question(replace(flow, scale=each), self.rows(indices, chains), polish=polish)
         flags = jax.tree.map(lambda leaf: False, flow)
         of_flow = jax.tree.leaves(replace(flags, scale=Scale(True, True)))
-        return partition(whole, (*of_flow, *self.differs, False))
+        of_polish = (False,) * len(jax.tree.leaves(polish))
+        return partition(whole, (*of_flow, *self.differs, False, *of_polish))
 
     def mapped(self, function: Callable[[Problem], Any]) -> Any:
         """function(problem) for every problem, (N, ...)."""

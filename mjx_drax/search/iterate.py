@@ -7,6 +7,7 @@ what differs from row to row has a leading axis. `Question` holds both, and `par
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,8 +22,10 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.method.descent import Info, diagnosed
 from mjx_drax.method.gauss_newton import GaussNewton
-from mjx_drax.method.langevin import Langevin, State
+from mjx_drax.method.langevin import Langevin, State, keep_finite
 from mjx_drax.method.model import expand
+from mjx_drax.polish import interior_point
+from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 
@@ -33,11 +36,15 @@ Tree = TypeVar("Tree")
 
 
 class Question(NamedTuple):
-    """What a row works on: a flow, a problem, and a number added to its iterations."""
+    """What a row works on: a flow, a problem, a number added to its iterations, and the polish.
+
+    Without a polish the flow's tail is what follows the noise.
+    """
 
     flow: Langevin
     problem: Problem
     offset: ArrayLike = np.int32(0)
+    polish: Polish | None = None
 
 
 def partition(question: Question, differs: tuple[bool, ...] | None) -> tuple[Question, Question]:
@@ -79,7 +86,12 @@ def begin(own: Question, shared: Question, knots: Trajectory, keys: Array) -> St
     """
     if keys.ndim == 0:
         keys = chain_keys(keys, len(knots.u))
-    return _by_row(shared, own, lambda q, *given: q.flow.init(q.problem, *given), knots, keys)
+    def first(q: Question, knots: Trajectory, key: Array) -> State:
+        state = q.flow.init(q.problem, knots, key)
+        return state if q.polish is None else interior_point.begin(q.problem, state)
+
+    started: State = _by_row(shared, own, first, knots, keys)
+    return started
 
 
 def chain_keys(key: Array, chains: int) -> Array:
@@ -122,6 +134,24 @@ def loop(
     def one(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
         return q.flow.step(q.problem, state, i + q.offset, tail, noise, moves)
 
+    def polished(i: Array, q: Question, state: State) -> State:
+        assert q.polish is not None  # for the type checker
+        return diffused_or_polished(q.flow, q.polish, q.problem, state, i + q.offset)
+
+    if shared.polish is not None:
+
+        @pruned
+        def refine(carry: tuple[Array, State]) -> tuple[Array, State]:
+            i, states = carry
+            return i + 1, _by_row(shared, own, partial(polished, i), states)
+
+        def unfinished(carry: tuple[Array, State]) -> Array:
+            i, states = carry
+            return (i < stop) & (states.polish.active & states.alive).any()
+
+        states = jax.lax.while_loop(unfinished, refine, (jnp.asarray(start, int), states))[1]
+        return states, _by_row(shared, own, _diagnosis, states) if diagnose else None
+
     if diagnose and tail and shared.problem.dynamics.kinked:
 
         @pruned  # jit does it to all but the bodies of loops
@@ -130,7 +160,7 @@ def loop(
             return moved
 
         zeros = jnp.zeros(states.alive.shape)
-        none = Info(zeros, zeros, zeros)
+        none = Info(zeros, zeros, zeros, zeros)
         return jax.lax.fori_loop(start, jnp.asarray(stop) + 1, step_or_diagnose, (states, none))
 
     @pruned
@@ -142,10 +172,32 @@ def loop(
     if not diagnose:
         return states, None
 
-    def diagnosis(q: Question, knots: Trajectory) -> Info:
-        return diagnosed(q.problem, knots, q.problem.values(knots))
+    return states, _by_row(shared, own, _diagnosis, states)
 
-    return states, _by_row(shared, own, diagnosis, states.trajectory)
+
+def _diagnosis(q: Question, state: State) -> Info:
+    """Where a chain is."""
+    knots = state.trajectory
+    info = diagnosed(q.problem, knots, q.problem.values(knots))
+    return info if q.polish is None else replace(info, residual=state.polish.residual)
+
+
+def diffused_or_polished(
+    flow: Langevin, polish: Polish, problem: Problem, state: State, iteration: Array
+) -> State:
+    """One iteration: a step of the flow while there is noise, then one of the polish."""
+    noisy, key = iteration < flow.iterations, jax.random.fold_in(state.key, iteration)
+    weights = flow.weights(jnp.minimum(flow.progress(iteration, True), 1.0))
+    model = flow.model(problem, state, weights, key, tail=False)
+    last = iteration + 1 == flow.iterations + polish.iterations
+    new = jax.lax.cond(
+        noisy,
+        lambda: flow.diffuse(problem, state, model, key),
+        lambda: interior_point.step(
+            problem, state, model, polish, last, guided=jnp.asarray(flow.iterations > 0)
+        ),
+    )
+    return keep_finite(state, new, iteration, None)
 
 
 iterate = compiled(full_precision(loop), static_argnames=("tail", "noise", "diagnose"))
@@ -157,20 +209,6 @@ iterate = compiled(full_precision(loop), static_argnames=("tail", "noise", "diag
 def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     """Cost, max|h| and bound violation of a batch of trajectories of one problem."""
     return jax.vmap(lambda z: diagnosed(problem, z, problem.values(z)))(trajectory)
-
-
-@jax.jit
-@full_precision
-def cost_and_violation(
-    own: Problem, shared: Problem, trajectory: Trajectory
-) -> tuple[Array, Array]:
-    """Cost and bound violation of every row's trajectory: `evaluate` without compiling f."""
-
-    def of_row(q: Any, z: Trajectory) -> tuple[Array, Array]:
-        return q.cost(z), q.bounds.violation(z)
-
-    found: tuple[Array, Array] = _by_row(shared, own, of_row, trajectory)  # type: ignore[arg-type]
-    return found
 
 
 @jax.jit

@@ -22,16 +22,29 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
+import jax.numpy as jnp
 
-from mjx_drax.base.errors import DraxError, require_not_negative, require_whole, shown
+from mjx_drax.base.errors import (
+    DraxError,
+    require_not_negative,
+    require_positive,
+    require_whole,
+    shown,
+)
+from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Geometric, Scale
+from mjx_drax.polish.interior_point import Polish
+from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.checks import check_flow
 
 ENOUGH, ENOUGH_KINKED = 0.95, 0.1
 """Default share of chains to be done; attempts are long where f has kinks."""
+
+
+TOLERANCE = {4: 1e-4, 8: 1e-8}
+"""Of the polish, by the bytes of a number."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,8 @@ class Restarts:
         heated: whether attempts after the first are heated, or descend like the first. None: unless
             f has kinks.
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
+        polish: what follows the noise, instead of the flow's tail. None: `Polish()` with the
+            tolerance of the precision, unless f has kinks or derivatives are sampled.
     """
 
     flow: Langevin = field(
@@ -91,18 +106,25 @@ class Restarts:
     enough: float | None = None
     heated: bool | None = None
     rollouts: Rollouts | None = None
+    polish: Polish | None = None
+
+    @property
+    def after(self) -> int:
+        """Iterations after those with noise: of the polish, or of the flow's tail without one."""
+        polish = self.polish
+        return polish.iterations if polish and polish.iterations else self.flow.tail
 
     @property
     def iterations(self) -> int:
         """Largest number of iterations that a solve does, without those between rollouts."""
-        return self.noise_ends[-1] + self.flow.tail
+        return self.noise_ends[-1] + self.after
 
     @property
     def noise_ends(self) -> list[int]:
         """After how many iterations the noise of each attempt ends."""
         flow = self.flow
         first = flow.iterations if self.descent is None else self.descent
-        return [first + i * (flow.iterations + flow.tail) for i in range(self.attempts)]
+        return [first + i * (flow.iterations + self.after) for i in range(self.attempts)]
 
     def first(self, cost_scale: float) -> Langevin:
         """The settings of the first attempt, for a scale of costs."""
@@ -117,8 +139,17 @@ class Restarts:
             "enough": ENOUGH_KINKED if kinked else ENOUGH,
             "heated": not kinked,
             "rollouts": Rollouts() if kinked else Rollouts(first=0, rounds=0),
+            "polish": self._polish_for(problem),
         }
         return replace(self, **{n: v for n, v in values.items() if getattr(self, n) is None})
+
+    def _polish_for(self, problem: Problem) -> Polish:
+        """The default polish; without iterations where f has kinks or derivatives are sampled."""
+        if problem.dynamics.kinked or not isinstance(self.flow.preconditioner, GaussNewton):
+            return Polish(iterations=0)
+        if not isinstance(self.flow.preconditioner.derivatives, Autodiff):
+            return Polish(iterations=0)
+        return Polish(TOLERANCE[problem.x_init.dtype.itemsize])
 
     def with_iterations(self, iterations: int) -> Restarts:
         """Other numbers of iterations, in proportion to those with noise."""
@@ -144,6 +175,11 @@ class Restarts:
             require_not_negative("enough", self.enough)
         if not isinstance(self.heated, bool | None):
             raise DraxError(f"heated is {shown(self.heated)}: give True, False or None.")
+        if not isinstance(self.polish, Polish | None):
+            raise DraxError(f"polish is {shown(self.polish)}: give Polish() or None.")
+        if self.polish is not None:
+            require_positive("polish.tolerance", self.polish.tolerance, "a number, such as 1e-4")
+            require_whole("polish.iterations", self.polish.iterations, 0)
         if not isinstance(self.rollouts, Rollouts | None):
             raise DraxError(f"rollouts is {shown(self.rollouts)}: give Rollouts() or None.")
         for name in ("first", "rounds", "iterations") if self.rollouts else ():
@@ -160,7 +196,7 @@ def as_restarts(solver: Langevin | Restarts | None) -> Restarts:
     if solver is None:
         return Restarts()
     if isinstance(solver, Langevin):
-        return Restarts(solver, descent=None, attempts=1)
+        return Restarts(solver, descent=None, attempts=1, polish=Polish(iterations=0))
     if not isinstance(solver, Restarts):
         raise DraxError(f"solver is {shown(solver)}: give a Langevin or a Restarts.")
     return solver
@@ -185,4 +221,5 @@ def settled(
 
 def scale_of(cost: float, noise: float) -> Scale:
     """Scales as numbers of one type, so that other values do not recompile."""
-    return Scale(np.float32(cost), np.float32(noise))
+    number = jnp.result_type(float).type
+    return Scale(number(cost), number(noise))

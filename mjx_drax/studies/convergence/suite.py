@@ -20,14 +20,18 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import write_json
+from mjx_drax.method.langevin import Langevin
+from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.iterate import Question, begin, iterate, partition
 from mjx_drax.studies.convergence.optimal_control import CASES, straight
 from mjx_drax.studies.convergence.programs import PROGRAMS
 from mjx_drax.studies.other_methods import ipopt_jax
@@ -36,6 +40,9 @@ from mjx_drax.studies.other_methods.ipopt import has_casadi
 Row = dict[str, Any]
 
 NAME = "convergence"
+
+TOLERANCE, LONGEST = 1e-8, 500
+"""Of both methods: on the residual, and the largest number of iterations."""
 
 TASKS: dict[str, Sequence[float] | None] = {
     "pendulum": [0.0, 0.0],
@@ -82,7 +89,14 @@ def posed(name: str) -> tuple[Problem, Trajectory]:
 
 def ours(problem: Problem, knots: Trajectory) -> tuple[int, float, float, str]:
     """Iterations, scaled KKT residual, cost and status of this library's local method."""
-    raise NotImplementedError
+    flow, polish = Langevin(iterations=0), Polish(TOLERANCE, LONGEST)
+    shared, own = partition(Question(flow, problem, polish=polish), None)
+    start = jax.tree.map(lambda a: jnp.asarray(a, float)[None], knots)
+    states = begin(own, shared, start, jax.random.key(0))
+    states, info = iterate((states, own), shared, 0, LONGEST)
+    done = states.polish
+    status = "optimal" if done.optimal[0] else "stalled" if done.stalled[0] else "out of iterations"
+    return int(done.iterations[0]), float(info.residual[0]), float(info.cost[0]), status
 
 
 def measure(name: str) -> Row:

@@ -1,0 +1,56 @@
+"""The exact Hessian of the Lagrangian, stage by stage, where f is cheap to differentiate twice.
+
+    H_k = d2/dz2 [ l + lambda'h_k + nu'g ]   at z = (dx_k, du_k);    at the end  d2/dx2 [ phi + nu'g ]
+
+in tangent space, at fixed multipliers. It may be indefinite.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_drax.method.model import Multipliers, QuadraticCost
+from mjx_drax.problem.differentiators import Differentiator
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
+
+
+def with_exact_hessian(
+    problem: Problem,
+    knots: Trajectory,
+    multipliers: Multipliers,
+    cost: QuadraticCost,
+    by: Differentiator,
+) -> QuadraticCost:
+    """The cost's model with the Lagrangian's Hessian in place of its own."""
+    dynamics, rows = problem.dynamics, multipliers.constraints
+    ndx, nu = dynamics.ndx, dynamics.nu
+    by = dynamics.step_differentiator(by)
+
+    def stage(x: Array, u: Array, x_next: Array, lambda_: Array, force: Array) -> Array:
+        def lagrangian(dz: Array) -> Array:
+            x_moved, u_moved = dynamics.integrate(x, dz[:ndx]), u + dz[ndx:]
+            seen = dynamics.observe(x_moved, u_moved)
+            defect = dynamics.difference(dynamics.step(x_moved, u_moved), x_next)
+            constrained = jnp.dot(force, problem.constraint(seen, u_moved))
+            return problem.running(seen, u_moved) + jnp.dot(lambda_, defect) + constrained
+
+        return by.hessian(lagrangian, ndx + nu)
+
+    def end(dx: Array) -> Array:
+        seen = dynamics.observe(dynamics.integrate(knots.x[-1], dx), jnp.zeros(nu))
+        return problem.terminal(seen) + jnp.dot(rows.terminal, problem.terminal_constraint(seen))
+
+    H = jax.vmap(stage)(
+        problem.stages(knots), knots.u, knots.x, multipliers.dynamics, rows.stage
+    )
+    H_end = by.hessian(end, ndx) if ndx else jnp.zeros((0, 0))
+    return QuadraticCost(
+        cost.gx,
+        cost.gu,
+        jnp.concatenate([H[:, :ndx, :ndx], H_end[None]]),
+        H[:, ndx:, :ndx],
+        H[:, ndx:, ndx:],
+    )

@@ -1,0 +1,506 @@
+"""A primal-dual interior point method with its linear algebra by the Riccati recursion.
+
+Each iteration solves for a step d and new multipliers, of the KKT system of
+
+    min  c(z) - rho sum log(slacks)    s.t.   h(z) = 0
+
+with Hessian H + V / S + delta D: Gauss-Newton's H with what stages have learned (`secant`), the
+bounds' multipliers over slacks V / S, and damping relative to the model's own diagonal D. Nothing
+is in units of a user's: D, the penalties of constraints and the barrier's weight are all measured.
+
+    damping     raised until the factorization exists and a step is found, lowered after each
+    step        the largest of a ladder, up to the boundary, that lowers the merit function
+                c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977, Powell)
+    barrier     rho falls when slopes and defects, as costs, are below ten times its value, and
+                rises where the boundary leaves only short steps
+    end         the `residual` is below the tolerance, and the chain stands still; or no step is
+                found however large the damping, and it has stalled
+
+After J. Nocedal and S. Wright, Numerical Optimization, 2006, chapter 19, and A. Waechter and L.
+Biegler, On the implementation of an interior-point filter line-search algorithm, 2006.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.bounds import Sides
+from mjx_drax.method.gauss_newton import slack_step, stage_steps, with_constraints
+from mjx_drax.method.langevin import State
+from mjx_drax.method.model import Model, Multipliers, QuadraticCost
+from mjx_drax.method.riccati import newton
+from mjx_drax.polish.curvature import with_exact_hessian
+from mjx_drax.polish.residual import STILL, Scales, products, residual_of, row_scales, slacks_of
+from mjx_drax.polish.secant import Secant
+from mjx_drax.problem.differentiators import Autodiff
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
+
+LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
+"""Sizes of steps that are tried at once, as shares of the way to the boundary."""
+
+LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
+"""Factors on the damping; damping below LEAST times `LESS`^8 is none, above MOST a chain stalls."""
+
+TRIES = 12
+"""Factorizations in one iteration, with more damping each time."""
+
+NEAR = 0.02
+"""Residual below which stages learn curvature."""
+
+BLOCKED, RAISE = 0.1, 3.0
+"""Steps to the boundary shorter than BLOCKED raise the barrier's weight by a factor RAISE."""
+
+LOOSE, STIFFER = 0.1, 10.0
+"""Where a step leaves more than LOOSE of the constraints, their penalties grow by STIFFER."""
+
+MARGIN = 1e-2
+"""Where the polish begins, knots keep this share of their range from its ends."""
+
+FIRST = 0.1
+"""First weight of the barrier, relative to the largest term of the slope as a cost."""
+
+SMALLEST = 1e-4
+"""Smallest entry of D, as a share of the largest, both times the squared extent of a coordinate."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Polish:
+    """How far to go.
+
+    Attributes:
+        tolerance: on the residual; 1e-4 is what float32 can reach, 1e-8 what float64 can.
+        iterations: at most so many; 0: no polish.
+    """
+
+    tolerance: ArrayLike = 1e-4
+    iterations: int = 200
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Progress:
+    """What a chain carries while it is polished.
+
+    Attributes:
+        barrier: rho; 0 before the first iteration.
+        damping: delta.
+        stiffness: kappa, of which the penalties of constraints are multiples.
+        penalties: eta, shaped like lambda.
+        secant: what stages have learned; () where Hessians are exact.
+        residual: of the knots where derivatives were taken last.
+        size: of the last step.
+        iterations: how many were done.
+        optimal: the residual is below the tolerance, and the chain stands still.
+        stalled: no step is found, and the chain stands still.
+    """
+
+    barrier: Array
+    damping: Array
+    stiffness: Array
+    penalties: Multipliers
+    secant: Any
+    residual: Array
+    size: Array
+    iterations: Array
+    optimal: Array
+    stalled: Array
+
+    @property
+    def active(self) -> Array:
+        """Whether the chain still moves."""
+        return ~(self.optimal | self.stalled)
+
+
+def begin(problem: Problem, state: State) -> State:
+    """The chain with what the polish carries."""
+    zero, no = jnp.zeros(()), jnp.zeros((), bool)
+    nothing = jax.tree.map(jnp.zeros_like, replace(state.multipliers, bounds=None))
+    progress = Progress(
+        barrier=zero,
+        damping=zero,
+        stiffness=0.1 / jnp.sqrt(jnp.finfo(zero.dtype).eps) + zero,
+        penalties=nothing,
+        secant=() if problem.dynamics.twice else Secant.none(problem),
+        residual=jnp.full((), jnp.inf, zero.dtype),
+        size=zero,
+        iterations=jnp.zeros((), int),
+        optimal=no,
+        stalled=no,
+    )
+    return replace(state, polish=progress)
+
+
+def step(
+    problem: Problem, state: State, model: Model, polish: Polish, last: Array, guided: Array
+) -> State:
+    """One iteration of a chain, from the model at its knots.
+
+    The first brings the knots inside the bounds and takes no step. The `last` takes no step either:
+    it measures the residual of where the chain ends. Where a flow has `guided` the chain, its
+    barrier's weight goes on from that of the flow.
+    """
+    before = state.polish
+    v = state.multipliers.bounds
+    residual, scales = residual_of(problem, model, v)
+    learned = before.secant
+    if isinstance(learned, Secant):
+        learned = learned.updated(
+            problem,
+            state.trajectory,
+            model.derivatives,
+            state.multipliers,
+            learns=before.size > 0.0,
+            near=residual.total < NEAR,
+        )
+    optimal = before.optimal | (residual.total < polish.tolerance)
+    now = replace(
+        before,
+        secant=learned,
+        residual=residual.total,
+        optimal=optimal,
+        iterations=before.iterations + 1,
+    )
+    stays = ~before.active | optimal | last
+    entered = _entered(problem, state, model, now, scales, guided)
+    moved = _moved(problem, state, model, now, residual.error, scales, polish)
+    first = before.barrier == 0.0
+    new = jax.tree.map(lambda a, b: jnp.where(first, a, b), entered, moved)
+    kept = replace(state, polish=jax.tree.map(lambda a, b: jnp.where(before.active, a, b), now, before))
+    return jax.tree.map(lambda a, b: jnp.where(stays & ~first, a, b), kept, new)
+
+
+def _entered(
+    problem: Problem, state: State, model: Model, now: Progress, scales: Scales, guided: Array
+) -> State:
+    """The chain inside its bounds, with central multipliers for the flow's barrier."""
+    knots = _inside(problem, model, scales)
+    assert model.derivatives is not None
+    _, largest = _diagonal(model.derivatives.cost, scales)
+    most = FIRST * jnp.maximum(scales.terms, STILL * largest)
+    rho = jnp.where(guided, jnp.clip(model.weights.barrier, 1e-6 * scales.cost, most), most)
+    v = _central(problem, knots, rho)
+    no = jnp.zeros((), bool)
+    now = replace(now, barrier=rho, size=jnp.zeros(()), optimal=no)
+    multipliers = replace(state.multipliers, bounds=v)
+    return replace(state, trajectory=knots, multipliers=multipliers, polish=now)
+
+
+def _inside(problem: Problem, model: Model, scales: Scales) -> Trajectory:
+    """The knots, a share MARGIN of their range or of their motion away from the ends."""
+    knots, g = model.trajectory, problem.inequalities(model.trajectory)
+    assert model.derivatives is not None
+    stage, end = row_scales(model.derivatives, scales)
+    slack = None
+    if g is not None:
+        rows = Stagewise(stage[problem.constraint.equalities :], end[problem.terminal_constraint.equalities :])
+        slack = jax.tree.map(lambda g, scale: jnp.maximum(-g, MARGIN * scale), g, rows)
+    lower, upper = problem.bounds.sides(replace(knots, slack=None))
+
+    def inside(z: Array, a: Array, b: Array, moves: Array) -> Array:
+        gap = MARGIN * jnp.where(jnp.isfinite(b - a), b - a, moves)
+        return jnp.clip(z, a + gap, b - gap)
+
+    extent = scales.x if problem.dynamics.ndx == problem.dynamics.nx else jnp.ones(())
+    return Trajectory(
+        inside(knots.x, lower.x, upper.x, extent), inside(knots.u, lower.u, upper.u, scales.u), slack
+    )
+
+
+def _moved(
+    problem: Problem,
+    state: State,
+    model: Model,
+    now: Progress,
+    error: Array,
+    scales: Scales,
+    polish: Polish,
+) -> State:
+    """The chain after a step."""
+    assert model.derivatives is not None and state.multipliers.bounds is not None
+    knots, v = state.trajectory, state.multipliers.bounds
+    ends = slacks_of(problem, knots)
+    finite = jax.tree.map(jnp.isfinite, ends)
+    count = jnp.maximum(sum(jnp.sum(f) for f in jax.tree.leaves(finite)), 1)
+    floor = 0.1 * polish.tolerance * scales.cost / count
+    rho = _barrier(problem, knots, v, now.barrier, error, floor, scales)
+
+    central = _central(problem, knots, rho)
+    model = replace(model, barrier=_barrier_model(problem, central, v, ends))
+    cost = model.derivatives.cost
+    if isinstance(now.secant, Secant):
+        cost = now.secant.added(cost, problem.dynamics.ndx)
+    else:
+        cost = with_exact_hessian(problem, knots, state.multipliers, cost, Autodiff())
+    diagonal, _ = _diagonal(cost, scales)
+    ok, d, rates, left, gains, damping = _direction(
+        model, cost, diagonal, now.damping, now.stiffness
+    )
+
+    # bounds: v slack = rho, linearized
+    moves = _displacement(problem, knots, d)
+    dv = (
+        jax.tree.map(lambda c, v, s, m: c - v - v * m / s, central[0], v[0], ends[0], moves),
+        jax.tree.map(lambda c, v, s, m: c - v + v * m / s, central[1], v[1], ends[1], moves),
+    )
+    share = jnp.maximum(0.99, 1.0 - rho / scales.terms)
+    reach = jnp.minimum(
+        _largest(ends[0], moves, share), _largest(ends[1], jax.tree.map(jnp.negative, moves), share)
+    )
+    reach_v = jnp.minimum(_largest(v[0], dv[0], share), _largest(v[1], dv[1], share))
+
+    before = replace(state.multipliers, bounds=None)
+    eta = jax.tree.map(
+        lambda e, m, r: jnp.maximum(jnp.abs(m + r), 0.5 * (e + jnp.abs(m + r))),
+        now.penalties,
+        before,
+        rates,
+    )
+    promised = _promised(model, d, left, eta)
+    rows = Multipliers(scales.x, Stagewise(*row_scales(model.derivatives, scales)))
+    alpha, X = _line_search(problem, model, d, reach, eta, rho, promised, rows)
+    found = ok & (alpha > 0.0)
+    alpha = jnp.where(found, alpha, 0.0)
+    X = jax.tree.map(lambda a, b: jnp.where(found, a, b), X, knots)
+    lambda_ = jax.tree.map(lambda m, r: m + jnp.where(found, alpha * r, 0.0), before, rates)
+    size_v = jnp.where(found, reach_v, 0.0)
+    v = jax.tree.map(lambda v, dv: v + jnp.where(found, size_v * dv, 0.0), v, dv)
+    v = _held(problem, X, v, rho)
+    lower = jnp.where(damping * LESS < LEAST * LESS**8, 0.0, damping * LESS)
+    after = jnp.where(found, lower, jnp.maximum(MORE * damping, LEAST))
+    shortfall, present = _worst(left, rows), _worst(model.h, rows)
+    loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
+    most = 1e-2 / jnp.finfo(alpha.dtype).eps
+    stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
+    blocked = jnp.minimum(RAISE * rho, 0.1 * scales.terms)
+    now = replace(
+        now,
+        barrier=jnp.where(reach < BLOCKED, jnp.maximum(rho, blocked), rho),
+        damping=after,
+        stiffness=stiffness,
+        penalties=jax.tree.map(lambda a, b: jnp.where(ok, a, b), eta, now.penalties),
+        size=alpha,
+        stalled=after > MOST,
+    )
+    return replace(
+        state,
+        trajectory=X,
+        multipliers=replace(lambda_, bounds=v),
+        gains=jnp.where(ok, gains, state.gains),
+        polish=now,
+    )
+
+
+def _barrier(
+    problem: Problem,
+    knots: Trajectory,
+    v: Sides,
+    rho: Array,
+    error: Array,
+    floor: Array,
+    scales: Scales,
+) -> Array:
+    """rho, lower where the barrier's problem is nearly solved; at most two steps down."""
+    central = [p for p in jax.tree.leaves(products(problem, knots, v))]
+    for _ in range(2):
+        gaps = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in central]
+        worst = jnp.maximum(error, jnp.max(jnp.stack(gaps)))
+        lower = jnp.minimum(0.2 * rho, scales.terms * (rho / scales.terms) ** 1.5)
+        rho = jnp.where(worst < 10.0 * rho, jnp.maximum(lower, floor), rho)
+    return jnp.maximum(rho, floor)
+
+
+def _barrier_model(
+    problem: Problem, central: Sides, v: Sides, ends: Sides
+) -> tuple[Trajectory, Trajectory]:
+    """Slope of the barrier, and its primal-dual curvature v / slack, in tangent space."""
+    tangent = problem.dynamics.tangent
+    slope = jax.tree.map(lambda a, b: b - a, *central)
+    curvature = jax.tree.map(lambda va, vb, a, b: va / a + vb / b, *v, *ends)
+    return replace(slope, x=tangent(slope.x)), replace(curvature, x=tangent(curvature.x))
+
+
+def _diagonal(cost: QuadraticCost, scales: Scales) -> tuple[tuple[Array, Array], Array]:
+    """D of states (ndx,) and of controls (nu,): the largest entry along the motion, floored.
+
+    Also the largest of them as a cost, times how far its coordinate moves, squared.
+    """
+    of_x = jnp.abs(jnp.einsum("kii->ki", cost.Hxx)).max(axis=0, initial=0.0)
+    of_u = jnp.abs(jnp.einsum("kii->ki", cost.Huu)).max(axis=0, initial=0.0)
+    x2, u2 = jnp.square(scales.x), jnp.square(scales.u)
+    largest = jnp.maximum((of_x * x2).max(initial=0.0), (of_u * u2).max(initial=0.0))
+    largest = jnp.where(largest > 0.0, largest, 1.0)
+    smallest = SMALLEST * largest
+    return (jnp.maximum(of_x, smallest / x2), jnp.maximum(of_u, smallest / u2)), largest
+
+
+def _direction(
+    model: Model,
+    cost: QuadraticCost,
+    diagonal: tuple[Array, Array],
+    damping: Array,
+    stiffness: Array,
+) -> tuple[Array, Trajectory, Multipliers, Multipliers, Array, Array]:
+    """Whether there is one, the step d, the multipliers' step, h + J d, gains, and the damping."""
+    derivatives, multipliers = model.derivatives, model.multipliers
+    assert derivatives is not None
+    of_x, of_u = diagonal
+    slope, curvature = model.barrier
+    penalties = _penalties(derivatives.stage, derivatives.terminal, diagonal, stiffness)
+    whole, stages, end = with_constraints(cost, derivatives, model, penalties, jnp.zeros(()))
+    stiff = jnp.full((), jnp.inf, of_u.dtype)  # the rows of the dynamics are regular
+    gx, gu = whole.gx.at[1:].add(slope.x), whole.gu + slope.u
+    Hxx = whole.Hxx.at[1:].add(jax.vmap(jnp.diag)(curvature.x))
+    Huu = whole.Huu + jax.vmap(jnp.diag)(curvature.u)
+
+    def solved(damping: Array) -> tuple[Array, Any, Any, Any]:
+        damped = QuadraticCost(
+            gx, gu, Hxx + damping * jnp.diag(of_x), whole.Hux, Huu + damping * jnp.diag(of_u)
+        )
+        step = newton(derivatives.dynamics, damped, multipliers.dynamics, stiff)
+        ds, rate = jax.vmap(lambda block, dz: slack_step(block, dz, penalties.stage))(
+            stages, stage_steps(step.dx, step.du)
+        )
+        ds_end, rate_end = slack_step(end, step.dx[-1], penalties.terminal)
+        has_slack = model.trajectory.slack is not None
+        d = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if has_slack else None)
+        rates = Multipliers(step.rate, Stagewise(rate, rate_end))
+        finite = jnp.isfinite(sum(jnp.sum(a) for a in jax.tree.leaves((d, rates))))
+        return finite, d, rates, step.K
+
+    def again(carry: Any) -> Any:
+        _, damping, tries = carry
+        damping = jnp.where(tries > 0, jnp.maximum(MORE * damping, LEAST), damping)
+        return solved(damping), damping, tries + 1
+
+    shapes = jax.eval_shape(solved, damping)
+    nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    (ok, d, rates, gains), damping, _ = jax.lax.while_loop(
+        lambda carry: ~carry[0][0] & (carry[2] < TRIES), again, (nothing, damping, 0)
+    )
+    rows = rates.constraints
+    of_rows = Stagewise(rows.stage / penalties.stage, rows.terminal / penalties.terminal)
+    left = Multipliers(jnp.zeros_like(rates.dynamics), of_rows)
+    return ok, d, rates, left, gains, damping
+
+
+def _penalties(
+    stage: Array, terminal: Array, diagonal: tuple[Array, Array], kappa: Array
+) -> Stagewise:
+    """Penalties of the rows, (m,) and (m_end,): kappa over J D^-1 J'."""
+    floor = jnp.sqrt(jnp.finfo(stage.dtype).tiny)
+    weights = 1.0 / jnp.concatenate(diagonal)
+    of_stage = (jnp.square(stage) @ weights).max(axis=0, initial=0.0)
+    of_end = jnp.square(terminal) @ (1.0 / diagonal[0])
+    return Stagewise(kappa / jnp.maximum(of_stage, floor), kappa / jnp.maximum(of_end, floor))
+
+
+def _displacement(problem: Problem, knots: Trajectory, d: Trajectory) -> Trajectory:
+    """By how much entries of the knots change with a step d of their tangents."""
+    if problem.dynamics.ndx == problem.dynamics.nx:
+        return d
+    return replace(d, x=problem.displaced(knots, d).x - knots.x)
+
+
+def _largest(slacks: Trajectory, moves: Trajectory, share: Array) -> Array:
+    """The largest step, at most 1, that uses up no more than that share of any slack."""
+
+    def largest(slack: Array, move: Array) -> Array:
+        shrinks = (move < 0.0) & jnp.isfinite(slack)
+        reach = -share * slack / jnp.where(shrinks, move, -1.0)
+        return jnp.where(shrinks, reach, 1.0).min(initial=1.0)
+
+    return jnp.min(jnp.stack(jax.tree.leaves(jax.tree.map(largest, slacks, moves))))
+
+
+def _central(problem: Problem, knots: Trajectory, rho: Array) -> Sides:
+    """rho / slack, and 0 where there is no bound."""
+    lower, upper = slacks_of(problem, knots)
+    return jax.tree.map(lambda s: rho / s, lower), jax.tree.map(lambda s: rho / s, upper)
+
+
+def _held(problem: Problem, knots: Trajectory, v: Sides, rho: Array) -> Sides:
+    """v within ten orders of magnitude of the central path."""
+    central = _central(problem, knots, rho)
+    held: Sides = jax.tree.map(lambda v, c: jnp.clip(v, 1e-10 * c, 1e10 * c), v, central)
+    return held
+
+
+def _promised(model: Model, d: Trajectory, left: Multipliers, eta: Multipliers) -> Array:
+    """The merit function's change along d, to first order; `left` is h + J d."""
+    assert model.derivatives is not None
+    gradient, slope = model.derivatives.cost, model.barrier[0]
+    of_cost = jnp.sum(gradient.gx[1:] * d.x) + jnp.sum(gradient.gu * d.u)
+    of_barrier = sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (slope, d)), strict=True))
+    of_defects = sum(
+        jnp.sum(e * (jnp.abs(after) - jnp.abs(before)))
+        for e, after, before in zip(*map(jax.tree.leaves, (eta, left, model.h)), strict=True)
+    )
+    return of_cost + of_barrier + of_defects
+
+
+def _line_search(
+    problem: Problem,
+    model: Model,
+    d: Trajectory,
+    reach: Array,
+    eta: Multipliers,
+    rho: Array,
+    promised: Array,
+    rows: Multipliers,
+) -> tuple[Array, Trajectory]:
+    """The largest step of the ladder that lowers the merit function as promised, or 0.
+
+    h, relative to `rows`, may not more than double where it is above 1: a cost without a lower
+    bound would lead away from the constraints for ever.
+    """
+    knots = model.trajectory
+
+    def candidate(alpha: Array) -> tuple[Array, Array, Trajectory]:
+        new = problem.displaced(knots, jax.tree.map(lambda d: alpha * d, d))
+        terms, h = _merit(problem, new, eta, rho)
+        return terms, _worst(h, rows), new
+
+    sizes = jnp.append(jnp.asarray(LADDER, d.u.dtype) * reach, 0.0)
+    merits, apart, candidates = jax.vmap(candidate)(sizes)
+    change = jnp.sum(merits - merits[-1], axis=1)
+    rounding = 10.0 * jnp.finfo(merits.dtype).eps * jnp.sum(jnp.abs(merits[-1]))
+    lowers = change <= 1e-4 * sizes * jnp.minimum(promised, 0.0) + rounding
+    lowers &= jnp.isfinite(change) & (apart <= jnp.maximum(2.0 * apart[-1], 1.0))
+    lowers = lowers.at[-1].set(True)
+    best = jnp.argmax(lowers)
+    chosen: Trajectory = jax.tree.map(lambda z: z[best], candidates)
+    return sizes[best], chosen
+
+
+def _worst(h: Multipliers, rows: Multipliers) -> Array:
+    """The largest |h|, relative to the scales of its rows."""
+    tiny = jnp.finfo(rows.dynamics.dtype).tiny
+    shares = jax.tree.map(lambda h, s: (jnp.abs(h) / (s + tiny)).max(initial=0.0), h, rows)
+    return jnp.max(jnp.stack(jax.tree.leaves(shares)))
+
+
+def _merit(
+    problem: Problem, knots: Trajectory, eta: Multipliers, rho: Array
+) -> tuple[Array, Multipliers]:
+    """c - rho sum log(slacks) + sum eta |h|, one term a stage, (K + 1,), and h."""
+    values = problem.values(knots)
+    r = problem.with_slack(values.constraints, knots.slack)
+    stages = jnp.sum(eta.dynamics * jnp.abs(values.defects), axis=-1)
+    stages = stages + jnp.sum(eta.constraints.stage * jnp.abs(r.stage), axis=-1)
+    logs = [
+        jnp.where(jnp.isinf(s), 0.0, jnp.log(s)) for s in jax.tree.leaves(slacks_of(problem, knots))
+    ]
+    for part in logs:
+        stages = stages - rho * (jnp.sum(part, axis=-1) if part.ndim > 1 else 0.0)
+    end = jnp.sum(eta.constraints.terminal * jnp.abs(r.terminal))
+    end = end - rho * sum(jnp.sum(part) for part in logs if part.ndim == 1)
+    return values.costs.at[:-1].add(stages).at[-1].add(end), Multipliers(values.defects, r)

@@ -1,0 +1,192 @@
+"""How far a chain is from a local optimum: the scaled residual of the KKT system, free of units.
+
+With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local optimum has
+
+    stationarity        dL/dz = 0         each coordinate relative to the largest sum, over the
+                                          motion, of the absolute values of the terms in it
+    defects             h = 0             relative to how far each coordinate of the state moves
+    constraints         r = 0             relative to what a row changes by as everything moves
+    complementarity     v slack = 0       summed over all bounds, relative to the cost
+
+and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
+from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
+from. The cost is measured by what its slope promises over the motion, sum |dc/dz| |z|. So neither
+units nor constants that are added to the cost change the residual.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.bounds import Sides
+from mjx_drax.method.model import Derivatives, Model, Multipliers
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
+
+CURVED = 1e-2
+"""Share of curvature times motion that a term counts as at least: at a perfect fit all vanish."""
+
+STILL = 1e-3
+"""Share of the largest term below which the scale of others does not fall."""
+
+REST = 1e-2
+"""Share of the box of initial knots that a coordinate moves by at least."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Scales:
+    """Sizes of what a motion is made of.
+
+    Attributes:
+        x, u: how far each coordinate moves, (ndx,) and (nu,).
+        terms: the largest sum of terms of dL/dz, times how far the coordinate moves: a cost.
+        cost: sum |dc/dz| |z| over the motion.
+    """
+
+    x: Array
+    u: Array
+    terms: Array
+    cost: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Residual:
+    """The four parts, scalars, and what the barrier is held against.
+
+    Attributes:
+        stationarity, defects, constraints, complementarity: relative.
+        error: the largest slope and defect as costs, for the barrier's weight.
+    """
+
+    stationarity: Array
+    defects: Array
+    constraints: Array
+    complementarity: Array
+    error: Array
+
+    @property
+    def total(self) -> Array:
+        """The largest of the four; infinite where one is not a number."""
+        parts = (self.stationarity, self.defects, self.constraints, self.complementarity)
+        largest = jnp.max(jnp.stack(parts))
+        return jnp.where(jnp.isnan(largest), jnp.inf, largest)
+
+
+def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Scales]:
+    """The residual at a model's knots and multipliers, with multipliers v of the bounds."""
+    derivatives, multipliers = model.derivatives, model.multipliers
+    assert derivatives is not None  # for the type checker
+    knots, tangent = model.trajectory, problem.dynamics.tangent
+    below, above = (Trajectory(tangent(side.x), side.u, side.slack) for side in v)
+    slope = slope_of(derivatives, multipliers, knots)
+    dual = jax.tree.map(lambda g, a, b: g - a + b, slope, below, above)
+    sizes = slope_of(jax.tree.map(jnp.abs, derivatives), _absolute(multipliers), knots, 1.0)
+    sizes = jax.tree.map(lambda s, a, b: s + a + b, sizes, below, above)
+
+    box, offset = problem.scatter, jax.vmap(problem.dynamics.difference, (0, None))
+    x = _moves(tangent(box.x_upper - box.x_lower), offset(knots.x, problem.x_init))
+    u = _moves(box.u_upper - box.u_lower, knots.u)
+    tiny = jnp.finfo(u.dtype).tiny
+    curved = [jnp.abs(jnp.einsum("kii->ki", H)) for H in (derivatives.cost.Hxx, derivatives.cost.Huu)]
+    curved = [CURVED * H.max(axis=0, initial=0.0) for H in curved]
+    peaks = [
+        jnp.maximum(part.max(axis=0, initial=0.0), H * moves)
+        for part, H, moves in zip((sizes.x, sizes.u), curved, (x, u), strict=True)
+    ]
+    terms = tiny + jnp.maximum((peaks[0] * x).max(initial=0.0), (peaks[1] * u).max(initial=0.0))
+    gradient = derivatives.cost
+    cost = STILL * terms + jnp.sum(jnp.abs(gradient.gx[1:]) * x) + jnp.sum(jnp.abs(gradient.gu) * u)
+    scales = Scales(x, u, terms, cost)
+
+    def relative(g: Array, peak: Array, extent: Array) -> Array:
+        share = jnp.abs(g).max(axis=0, initial=0.0) / jnp.maximum(peak, STILL * terms / extent)
+        return share.max(initial=0.0)
+
+    stationarity = jnp.maximum(
+        relative(dual.x, peaks[0], x), relative(dual.u, peaks[1], u)
+    )
+    defects = (jnp.abs(model.h.dynamics) / x).max(initial=0.0)
+    rows, rows_end = row_scales(derivatives, scales)
+    r = model.h.constraints
+    of_stage, of_end = jnp.abs(r.stage) / (rows + tiny), jnp.abs(r.terminal) / (rows_end + tiny)
+    gap = sum(jnp.sum(part) for part in jax.tree.leaves(products(problem, knots, v)))
+    forces = jnp.abs(model.h.dynamics * multipliers.dynamics).max(initial=0.0)
+    for part, force in zip(
+        jax.tree.leaves(r), jax.tree.leaves(multipliers.constraints), strict=True
+    ):
+        forces = jnp.maximum(forces, jnp.abs(part * force).max(initial=0.0))
+    slopes = (jnp.abs(dual.x) * x).max(initial=0.0), (jnp.abs(dual.u) * u).max(initial=0.0)
+    error = jnp.maximum(forces, jnp.maximum(*slopes))
+    if knots.slack is not None:
+        pairs = zip(jax.tree.leaves(dual.slack), jax.tree.leaves(knots.slack), strict=True)
+        of_slack = jnp.max(jnp.stack([jnp.abs(g * s).max(initial=0.0) for g, s in pairs]))
+        error = jnp.maximum(error, of_slack)
+        stationarity = jnp.maximum(stationarity, of_slack / (terms + of_slack))
+    return Residual(
+        stationarity,
+        defects,
+        jnp.maximum(of_stage.max(initial=0.0), of_end.max(initial=0.0)),
+        gap / cost,
+        error,
+    ), scales
+
+
+def slope_of(
+    derivatives: Derivatives, multipliers: Multipliers, knots: Trajectory, sign: float = -1.0
+) -> Trajectory:
+    """grad c + J'lambda in tangent space; with sign = 1, of absolute values, the sum of terms."""
+    dynamics, cost, stage, terminal = derivatives
+    ndx, rows = dynamics.h.shape[-1], multipliers.constraints
+    of_stage = jnp.einsum("kij,ki->kj", stage, rows.stage)
+    gx = cost.gx.at[:-1].add(of_stage[:, :ndx])
+    gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", dynamics.A, multipliers.dynamics))
+    gx = gx.at[-1].add(terminal.T @ rows.terminal)
+    gu = cost.gu + of_stage[:, ndx:]
+    gu = gu + jnp.einsum("kij,ki->kj", dynamics.B, multipliers.dynamics)
+    slack = None
+    if knots.slack is not None:  # the rows of inequalities, the last ones
+        slack = jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], knots.slack, rows)
+    return Trajectory(gx[1:] + sign * multipliers.dynamics, gu, slack)
+
+
+def row_scales(derivatives: Derivatives, scales: Scales) -> tuple[Array, Array]:
+    """What rows of constraints change by as everything moves, (m,) and (m_end,)."""
+    both = jnp.concatenate([scales.x, scales.u])
+    stage = (jnp.abs(derivatives.stage) @ both).max(axis=0, initial=0.0)
+    return stage, jnp.abs(derivatives.terminal) @ scales.x
+
+
+def products(problem: Problem, knots: Trajectory, v: Sides) -> Sides:
+    """v slack of every bound, lower and upper; 0 where there is none."""
+    slacks = slacks_of(problem, knots)
+    return (
+        jax.tree.map(lambda v, s: jnp.where(jnp.isinf(s), 0.0, v * s), v[0], slacks[0]),
+        jax.tree.map(lambda v, s: jnp.where(jnp.isinf(s), 0.0, v * s), v[1], slacks[1]),
+    )
+
+
+def slacks_of(problem: Problem, knots: Trajectory) -> Sides:
+    """Distances from the lower and the upper ends; infinite where there is none."""
+    lower, upper = problem.bounds.sides(knots)
+    return jax.tree.map(jnp.subtract, knots, lower), jax.tree.map(jnp.subtract, upper, knots)
+
+
+def _moves(width: Array, offsets: Array) -> Array:
+    """How far each coordinate moves, given the width of the box of initial knots."""
+    floor = jnp.where(jnp.isfinite(width), jnp.abs(width), 0.0)
+    floor = REST * (floor if floor.ndim == 1 else floor.max(axis=0))
+    moves = jnp.maximum(jnp.abs(offsets).max(axis=0, initial=0.0), floor)
+    return jnp.where(moves > 0.0, moves, 1.0)
+
+
+def _absolute(multipliers: Multipliers) -> Multipliers:
+    """lambda without signs."""
+    dynamics, rows = jnp.abs(multipliers.dynamics), multipliers.constraints
+    return Multipliers(dynamics, Stagewise(jnp.abs(rows.stage), jnp.abs(rows.terminal)))
