@@ -47,7 +47,10 @@ class Info:
 
 def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     """The diagnostics of a trajectory whose functions have these values."""
-    outside, unknown = problem.bounds.violation(trajectory), jnp.full((), jnp.nan, trajectory.u.dtype)
+    outside, unknown = (
+        problem.bounds.violation(trajectory),
+        jnp.full((), jnp.nan, trajectory.u.dtype),
+    )
     return Info(values.cost, problem.worst(values), outside, unknown)
 
 

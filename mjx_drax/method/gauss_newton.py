@@ -152,7 +152,11 @@ def _with_barrier(
 
 
 def with_constraints(
-    cost: QuadraticCost, derivatives: Derivatives, model: Model, penalties: Stagewise, damping: Array
+    cost: QuadraticCost,
+    derivatives: Derivatives,
+    model: Model,
+    penalties: Stagewise,
+    damping: Array,
 ) -> tuple[QuadraticCost, Eliminated, Eliminated]:
     """The cost with the constraints of every stage, and what their slacks are recovered from.
 
@@ -171,7 +175,11 @@ def with_constraints(
     )
     g_end, H_end, end = reduce(
         penalties.terminal,
-        derivatives.terminal, r.terminal, nu.terminal, slope.terminal, curvature.terminal
+        derivatives.terminal,
+        r.terminal,
+        nu.terminal,
+        slope.terminal,
+        curvature.terminal,
     )
     whole = QuadraticCost(
         cost.gx + jnp.concatenate([g[:, :ndx], g_end[None]]),

@@ -43,9 +43,7 @@ def with_exact_hessian(
         seen = dynamics.observe(dynamics.integrate(knots.x[-1], dx), jnp.zeros(nu))
         return problem.terminal(seen) + jnp.dot(rows.terminal, problem.terminal_constraint(seen))
 
-    H = jax.vmap(stage)(
-        problem.stages(knots), knots.u, knots.x, multipliers.dynamics, rows.stage
-    )
+    H = jax.vmap(stage)(problem.stages(knots), knots.u, knots.x, multipliers.dynamics, rows.stage)
     H_end = by.hessian(end, ndx) if ndx else jnp.zeros((0, 0))
     return QuadraticCost(
         cost.gx,

@@ -37,7 +37,15 @@ from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Model, Multipliers, QuadraticCost
 from mjx_drax.method.riccati import newton
 from mjx_drax.polish.curvature import with_exact_hessian
-from mjx_drax.polish.residual import STILL, Scales, products, residual_of, row_scales, slacks_of
+from mjx_drax.polish.residual import (
+    STILL,
+    Residual,
+    Scales,
+    products,
+    residual_of,
+    row_scales,
+    slacks_of,
+)
 from mjx_drax.polish.secant import Secant
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
@@ -98,7 +106,7 @@ class Progress:
         secant: what stages have learned; () where Hessians are exact.
         residual: of the knots where derivatives were taken last.
         size: of the last step.
-        iterations: how many were done.
+        iterations: how many steps were looked for.
         optimal: the residual is below the tolerance, and the chain stands still.
         stalled: no step is found, and the chain stands still.
     """
@@ -159,7 +167,6 @@ def step(
             model.derivatives,
             state.multipliers,
             learns=before.size > 0.0,
-            near=residual.total < NEAR,
         )
     optimal = before.optimal | (residual.total < polish.tolerance)
     now = replace(
@@ -167,14 +174,15 @@ def step(
         secant=learned,
         residual=residual.total,
         optimal=optimal,
-        iterations=before.iterations + 1,
     )
     stays = ~before.active | optimal | last
     entered = _entered(problem, state, model, now, scales, guided)
-    moved = _moved(problem, state, model, now, residual.error, scales, polish)
+    moved = _moved(problem, state, model, now, residual, scales, polish)
     first = before.barrier == 0.0
     new = jax.tree.map(lambda a, b: jnp.where(first, a, b), entered, moved)
-    kept = replace(state, polish=jax.tree.map(lambda a, b: jnp.where(before.active, a, b), now, before))
+    kept = replace(
+        state, polish=jax.tree.map(lambda a, b: jnp.where(before.active, a, b), now, before)
+    )
     return jax.tree.map(lambda a, b: jnp.where(stays & ~first, a, b), kept, new)
 
 
@@ -201,7 +209,9 @@ def _inside(problem: Problem, model: Model, scales: Scales) -> Trajectory:
     stage, end = row_scales(model.derivatives, scales)
     slack = None
     if g is not None:
-        rows = Stagewise(stage[problem.constraint.equalities :], end[problem.terminal_constraint.equalities :])
+        rows = Stagewise(
+            stage[problem.constraint.equalities :], end[problem.terminal_constraint.equalities :]
+        )
         slack = jax.tree.map(lambda g, scale: jnp.maximum(-g, MARGIN * scale), g, rows)
     lower, upper = problem.bounds.sides(replace(knots, slack=None))
 
@@ -211,7 +221,9 @@ def _inside(problem: Problem, model: Model, scales: Scales) -> Trajectory:
 
     extent = scales.x if problem.dynamics.ndx == problem.dynamics.nx else jnp.ones(())
     return Trajectory(
-        inside(knots.x, lower.x, upper.x, extent), inside(knots.u, lower.u, upper.u, scales.u), slack
+        inside(knots.x, lower.x, upper.x, extent),
+        inside(knots.u, lower.u, upper.u, scales.u),
+        slack,
     )
 
 
@@ -220,7 +232,7 @@ def _moved(
     state: State,
     model: Model,
     now: Progress,
-    error: Array,
+    residual: Residual,
     scales: Scales,
     polish: Polish,
 ) -> State:
@@ -228,16 +240,15 @@ def _moved(
     assert model.derivatives is not None and state.multipliers.bounds is not None
     knots, v = state.trajectory, state.multipliers.bounds
     ends = slacks_of(problem, knots)
-    finite = jax.tree.map(jnp.isfinite, ends)
-    count = jnp.maximum(sum(jnp.sum(f) for f in jax.tree.leaves(finite)), 1)
-    floor = 0.1 * polish.tolerance * scales.cost / count
-    rho = _barrier(problem, knots, v, now.barrier, error, floor, scales)
+    rho = _barrier(problem, knots, v, now.barrier, residual, polish, scales)
 
     central = _central(problem, knots, rho)
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
     cost = model.derivatives.cost
     if isinstance(now.secant, Secant):
-        cost = now.secant.added(cost, problem.dynamics.ndx)
+        near = residual.total < NEAR
+        used = replace(now.secant, B=jnp.where(near, now.secant.B, 0.0))
+        cost = used.added(cost, problem.dynamics.ndx)
     else:
         cost = with_exact_hessian(problem, knots, state.multipliers, cost, Autodiff())
     diagonal, _ = _diagonal(cost, scales)
@@ -264,7 +275,7 @@ def _moved(
         before,
         rates,
     )
-    promised = _promised(model, d, left, eta)
+    promised = _promised(model, d, left, eta) - rho * _logs(ends, moves, reach)
     rows = Multipliers(scales.x, Stagewise(*row_scales(model.derivatives, scales)))
     alpha, X = _line_search(problem, model, d, reach, eta, rho, promised, rows)
     found = ok & (alpha > 0.0)
@@ -288,6 +299,7 @@ def _moved(
         stiffness=stiffness,
         penalties=jax.tree.map(lambda a, b: jnp.where(ok, a, b), eta, now.penalties),
         size=alpha,
+        iterations=now.iterations + 1,
         stalled=after > MOST,
     )
     return replace(
@@ -304,17 +316,26 @@ def _barrier(
     knots: Trajectory,
     v: Sides,
     rho: Array,
-    error: Array,
-    floor: Array,
+    residual: Residual,
+    polish: Polish,
     scales: Scales,
 ) -> Array:
-    """rho, lower where the barrier's problem is nearly solved; at most two steps down."""
-    central = [p for p in jax.tree.leaves(products(problem, knots, v))]
+    """rho, lower where the barrier's problem is nearly solved; at most two steps down.
+
+    It is if slopes, defects and gaps are below ten times rho, as costs; or if the residual's other
+    parts are small, and below what the bounds' part is at this rho.
+    """
+    gaps = jax.tree.leaves(products(problem, knots, v))
+    count = jnp.maximum(sum((jnp.sum(p > 0.0) for p in gaps), start=jnp.zeros((), int)), 1)
+    floor = 0.1 * polish.tolerance * scales.cost / count
+    others = residual.others
     for _ in range(2):
-        gaps = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in central]
-        worst = jnp.maximum(error, jnp.max(jnp.stack(gaps)))
+        off = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in gaps]
+        centred = jnp.max(jnp.stack(off)) < 10.0 * rho
+        small = (others < NEAR) & (others < count * rho / scales.cost)
         lower = jnp.minimum(0.2 * rho, scales.terms * (rho / scales.terms) ** 1.5)
-        rho = jnp.where(worst < 10.0 * rho, jnp.maximum(lower, floor), rho)
+        falls = centred & ((residual.error < 10.0 * rho) | small)
+        rho = jnp.where(falls, jnp.maximum(lower, floor), rho)
     return jnp.maximum(rho, floor)
 
 
@@ -329,17 +350,17 @@ def _barrier_model(
 
 
 def _diagonal(cost: QuadraticCost, scales: Scales) -> tuple[tuple[Array, Array], Array]:
-    """D of states (ndx,) and of controls (nu,): the largest entry along the motion, floored.
+    """D of states (ndx,) and of controls (nu,): sum |H_ij| |z_j| / |z_i|, floored.
 
-    Also the largest of them as a cost, times how far its coordinate moves, squared.
+    The largest along the motion, z being how far coordinates move. Also the largest of D |z|^2.
     """
-    of_x = jnp.abs(jnp.einsum("kii->ki", cost.Hxx)).max(axis=0, initial=0.0)
-    of_u = jnp.abs(jnp.einsum("kii->ki", cost.Huu)).max(axis=0, initial=0.0)
-    x2, u2 = jnp.square(scales.x), jnp.square(scales.u)
-    largest = jnp.maximum((of_x * x2).max(initial=0.0), (of_u * u2).max(initial=0.0))
+    x, u = scales.x, scales.u
+    Hxx, Hux, Huu = (jnp.abs(H).max(axis=0) for H in (cost.Hxx, cost.Hux, cost.Huu))
+    of_x, of_u = x * (Hxx @ x + Hux.T @ u), u * (Hux @ x + Huu @ u)
+    largest = jnp.maximum(of_x.max(initial=0.0), of_u.max(initial=0.0))
     largest = jnp.where(largest > 0.0, largest, 1.0)
-    smallest = SMALLEST * largest
-    return (jnp.maximum(of_x, smallest / x2), jnp.maximum(of_u, smallest / u2)), largest
+    floored = [jnp.maximum(D, SMALLEST * largest) for D in (of_x, of_u)]
+    return (floored[0] / jnp.square(x), floored[1] / jnp.square(u)), largest
 
 
 def _direction(
@@ -435,16 +456,29 @@ def _held(problem: Problem, knots: Trajectory, v: Sides, rho: Array) -> Sides:
 
 
 def _promised(model: Model, d: Trajectory, left: Multipliers, eta: Multipliers) -> Array:
-    """The merit function's change along d, to first order; `left` is h + J d."""
+    """The change of c + sum eta |h| along d, to first order; `left` is h + J d."""
     assert model.derivatives is not None
-    gradient, slope = model.derivatives.cost, model.barrier[0]
+    gradient = model.derivatives.cost
     of_cost = jnp.sum(gradient.gx[1:] * d.x) + jnp.sum(gradient.gu * d.u)
-    of_barrier = sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (slope, d)), strict=True))
     of_defects = sum(
         jnp.sum(e * (jnp.abs(after) - jnp.abs(before)))
         for e, after, before in zip(*map(jax.tree.leaves, (eta, left, model.h)), strict=True)
     )
-    return of_cost + of_barrier + of_defects
+    return of_cost + of_defects
+
+
+def _logs(ends: Sides, moves: Trajectory, reach: Array) -> Array:
+    """How much sum log(slacks) grows up to the boundary, for each unit of step.
+
+    Its slope would promise too much where a slack is far too small.
+    """
+
+    def growth(slack: Array, move: Array) -> Array:
+        return jnp.sum(jnp.where(jnp.isinf(slack), 0.0, jnp.log1p(reach * move / slack)))
+
+    back = jax.tree.map(jnp.negative, moves)
+    sides = (jax.tree.map(growth, ends[0], moves), jax.tree.map(growth, ends[1], back))
+    return sum(jax.tree.leaves(sides)) / reach
 
 
 def _line_search(

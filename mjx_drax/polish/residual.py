@@ -72,10 +72,14 @@ class Residual:
     error: Array
 
     @property
+    def others(self) -> Array:
+        """The largest of all but complementarity."""
+        return jnp.maximum(self.stationarity, jnp.maximum(self.defects, self.constraints))
+
+    @property
     def total(self) -> Array:
         """The largest of the four; infinite where one is not a number."""
-        parts = (self.stationarity, self.defects, self.constraints, self.complementarity)
-        largest = jnp.max(jnp.stack(parts))
+        largest = jnp.maximum(self.others, self.complementarity)
         return jnp.where(jnp.isnan(largest), jnp.inf, largest)
 
 
@@ -94,7 +98,9 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     x = _moves(tangent(box.x_upper - box.x_lower), offset(knots.x, problem.x_init))
     u = _moves(box.u_upper - box.u_lower, knots.u)
     tiny = jnp.finfo(u.dtype).tiny
-    curved = [jnp.abs(jnp.einsum("kii->ki", H)) for H in (derivatives.cost.Hxx, derivatives.cost.Huu)]
+    curved = [
+        jnp.abs(jnp.einsum("kii->ki", H)) for H in (derivatives.cost.Hxx, derivatives.cost.Huu)
+    ]
     curved = [CURVED * H.max(axis=0, initial=0.0) for H in curved]
     peaks = [
         jnp.maximum(part.max(axis=0, initial=0.0), H * moves)
@@ -109,9 +115,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         share = jnp.abs(g).max(axis=0, initial=0.0) / jnp.maximum(peak, STILL * terms / extent)
         return share.max(initial=0.0)
 
-    stationarity = jnp.maximum(
-        relative(dual.x, peaks[0], x), relative(dual.u, peaks[1], u)
-    )
+    stationarity = jnp.maximum(relative(dual.x, peaks[0], x), relative(dual.u, peaks[1], u))
     defects = (jnp.abs(model.h.dynamics) / x).max(initial=0.0)
     rows, rows_end = row_scales(derivatives, scales)
     r = model.h.constraints

@@ -64,9 +64,8 @@ class Secant:
         derivatives: Derivatives,
         multipliers: Multipliers,
         learns: Array,
-        near: Array,
     ) -> Secant:
-        """What is known at new knots; B stays where not `learns`, and is 0 where not `near`."""
+        """What is known at new knots; B stays where not `learns`."""
         dynamics, cost, stage, _ = derivatives
         J = jnp.concatenate([jnp.concatenate([dynamics.A, dynamics.B], axis=2), stage], axis=1)
         g = jnp.concatenate([cost.gx[:-1], cost.gu], axis=1)
@@ -79,7 +78,7 @@ class Secant:
         terms = jnp.abs(g) + jnp.einsum("kij,ki->kj", jnp.abs(J), jnp.abs(forces))
         noise = NOISE * jnp.finfo(g.dtype).eps * terms
         learned = jax.vmap(_rank_one)(self.B, _blocks(cost) + self.B, s, y, noise)
-        B = jnp.where(near, jnp.where(learns, learned, self.B), 0.0)
+        B = jnp.where(learns, learned, self.B)
         return Secant(B, J, g, x, knots.u)
 
     def added(self, cost: QuadraticCost, ndx: int) -> QuadraticCost:

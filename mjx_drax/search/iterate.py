@@ -86,6 +86,7 @@ def begin(own: Question, shared: Question, knots: Trajectory, keys: Array) -> St
     """
     if keys.ndim == 0:
         keys = chain_keys(keys, len(knots.u))
+
     def first(q: Question, knots: Trajectory, key: Array) -> State:
         state = q.flow.init(q.problem, knots, key)
         return state if q.polish is None else interior_point.begin(q.problem, state)
