@@ -184,7 +184,7 @@ class Langevin:
     ) -> State:
         """One step with noise, from the model at the chain's knots."""
         to = self.preconditioner.direction(problem, model, key, state.memory)
-        X = self._diffused(problem, state, to, model.weights, key, tail)
+        X = self._diffused(problem, state, model, to, key, tail)
         new = self._moved(state, X, jnp.asarray(self.step_size), to)
         if tail:  # for which bounds have multipliers of their own, central at first
             v = self.bounds.multipliers(problem.bounds, X, model.weights.barrier)
@@ -219,16 +219,10 @@ class Langevin:
         return expand(problem, self.bounds, state.trajectory, present, damped, by, key_model)
 
     def _diffused(
-        self,
-        problem: Problem,
-        state: State,
-        to: Direction,
-        weights: Weights,
-        key: Array,
-        tail: bool,
+        self, problem: Problem, state: State, model: Model, to: Direction, key: Array, tail: bool
     ) -> Trajectory:
         """X + alpha d + sigma sqrt(2 alpha) n, kept inside the bounds."""
-        alpha, X, bounds = self.step_size, state.trajectory, self.bounds
+        alpha, X, bounds, weights = self.step_size, state.trajectory, self.bounds, model.weights
         sigma = weights.noise * jnp.sqrt(2.0 * alpha)
         change = jax.tree.map(lambda d, n: alpha * d + sigma * n, to.drift, to.noise)
         new = problem.displaced(X, change)
@@ -247,8 +241,7 @@ def keep_finite(old: State, new: State, iteration: Array, moves: Array | None) -
     names = ("trajectory", "multipliers", "damping", "gains", "memory")
     before, after = ({name: getattr(state, name) for name in names} for state in (old, new))
     pairs = zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True)
-    moved = [a for a, b in pairs if a is not b]
-    finite = all_finite(moved)
+    finite = all_finite([a for a, b in pairs if a is not b])
     finite = finite if moves is None else finite | ~moves
     alive = old.alive & finite
     takes = alive if moves is None else alive & moves

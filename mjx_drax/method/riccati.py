@@ -88,7 +88,7 @@ class Step:
 def factorize(
     model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array
 ) -> Factorization:
-    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, which may be infinite."""
+    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, at most infinite."""
     soft, identity = 1.0 / penalty, jnp.eye(model.A.shape[-1], dtype=model.A.dtype)
 
     def stage(

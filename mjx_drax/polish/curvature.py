@@ -1,6 +1,7 @@
 """The exact Hessian of the Lagrangian, stage by stage, where f is cheap to differentiate twice.
 
-    H_k = d2/dz2 [ l + lambda'h_k + nu'g ]   at z = (dx_k, du_k);    at the end  d2/dx2 [ phi + nu'g ]
+    H_k = d2/dz2 [ l + lambda'h_k + nu'g ]    at z = (dx_k, du_k)
+    H_K = d2/dx2 [ phi + nu'g ]               at the end
 
 in tangent space, at fixed multipliers. It may be indefinite.
 """
