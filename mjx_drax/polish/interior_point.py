@@ -51,13 +51,16 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
+ARMIJO, NARROWER = 1e-4, 0.7
+"""Share of what is promised that a step must bring, and factor on the funnel when it is used."""
+
 LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
 """Sizes of steps that are tried at once, as shares of the way to the boundary."""
 
 LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 """Factors on the damping; damping below LEAST times `LESS`^8 is none, above MOST a chain stalls."""
 
-TRIES = 12
+TRIES = 3
 """Factorizations in one iteration, with more damping each time."""
 
 NEAR = 0.02
@@ -106,6 +109,7 @@ class Progress:
         secant: what stages have learned; () where Hessians are exact.
         residual: of the knots where derivatives were taken last.
         size: of the last step.
+        funnel: up to where h, relative to the scales of its rows, may grow while the cost falls.
         iterations: how many steps were looked for.
         optimal: the residual is below the tolerance, and the chain stands still.
         stalled: no step is found, and the chain stands still.
@@ -118,6 +122,7 @@ class Progress:
     secant: Any
     residual: Array
     size: Array
+    funnel: Array
     iterations: Array
     optimal: Array
     stalled: Array
@@ -140,6 +145,7 @@ def begin(problem: Problem, state: State) -> State:
         secant=() if problem.dynamics.twice else Secant.none(problem),
         residual=jnp.full((), jnp.inf, zero.dtype),
         size=zero,
+        funnel=1.0 + zero,
         iterations=jnp.zeros((), int),
         optimal=no,
         stalled=no,
@@ -206,7 +212,7 @@ def _inside(problem: Problem, model: Model, scales: Scales) -> Trajectory:
     """The knots, a share MARGIN of their range or of their motion away from the ends."""
     knots, g = model.trajectory, problem.inequalities(model.trajectory)
     assert model.derivatives is not None
-    stage, end = row_scales(model.derivatives, scales)
+    stage, end = row_scales(model.derivatives, scales, model.trajectory)
     slack = None
     if g is not None:
         rows = Stagewise(
@@ -275,9 +281,12 @@ def _moved(
         before,
         rates,
     )
-    promised = _promised(model, d, left, eta) - rho * _logs(ends, moves, reach)
-    rows = Multipliers(scales.x, Stagewise(*row_scales(model.derivatives, scales)))
-    alpha, X = _line_search(problem, model, d, reach, eta, rho, promised, rows)
+    of_cost, of_defects = _promised(model, d, left, eta)
+    promised = of_cost - rho * _logs(ends, moves, reach), of_defects
+    rows = Multipliers(
+        scales.x, Stagewise(*row_scales(model.derivatives, scales, model.trajectory))
+    )
+    alpha, X, parts = _line_search(problem, model, d, reach, eta, rho, promised, rows, now.funnel)
     found = ok & (alpha > 0.0)
     alpha = jnp.where(found, alpha, 0.0)
     X = jax.tree.map(lambda a, b: jnp.where(found, a, b), X, knots)
@@ -299,6 +308,7 @@ def _moved(
         stiffness=stiffness,
         penalties=jax.tree.map(lambda a, b: jnp.where(ok, a, b), eta, now.penalties),
         size=alpha,
+        funnel=jnp.where(parts, NARROWER * now.funnel, now.funnel),
         iterations=now.iterations + 1,
         stalled=after > MOST,
     )
@@ -455,8 +465,10 @@ def _held(problem: Problem, knots: Trajectory, v: Sides, rho: Array) -> Sides:
     return held
 
 
-def _promised(model: Model, d: Trajectory, left: Multipliers, eta: Multipliers) -> Array:
-    """The change of c + sum eta |h| along d, to first order; `left` is h + J d."""
+def _promised(
+    model: Model, d: Trajectory, left: Multipliers, eta: Multipliers
+) -> tuple[Array, Array]:
+    """The changes of c and of sum eta |h| along d, to first order; `left` is h + J d."""
     assert model.derivatives is not None
     gradient = model.derivatives.cost
     of_cost = jnp.sum(gradient.gx[1:] * d.x) + jnp.sum(gradient.gu * d.u)
@@ -464,7 +476,7 @@ def _promised(model: Model, d: Trajectory, left: Multipliers, eta: Multipliers) 
         jnp.sum(e * (jnp.abs(after) - jnp.abs(before)))
         for e, after, before in zip(*map(jax.tree.leaves, (eta, left, model.h)), strict=True)
     )
-    return of_cost + of_defects
+    return of_cost, of_defects
 
 
 def _logs(ends: Sides, moves: Trajectory, reach: Array) -> Array:
@@ -488,31 +500,39 @@ def _line_search(
     reach: Array,
     eta: Multipliers,
     rho: Array,
-    promised: Array,
+    promised: tuple[Array, Array],
     rows: Multipliers,
-) -> tuple[Array, Trajectory]:
+    funnel: Array,
+) -> tuple[Array, Trajectory, Array]:
     """The largest step of the ladder that lowers the merit function as promised, or 0.
 
     h, relative to `rows`, may not more than double where it is above 1: a cost without a lower
-    bound would lead away from the constraints for ever.
+    bound would lead away from the constraints for ever. A step that lowers the cost as promised
+    may let h grow up to the `funnel`, which then narrows: the merit function alone allows but
+    short steps along curved constraints (Maratos 1978; a funnel: Gould and Toint 2010).
+
+    Returns:
+        the size, the new knots, and whether the funnel was used.
     """
     knots = model.trajectory
 
-    def candidate(alpha: Array) -> tuple[Array, Array, Trajectory]:
+    def candidate(alpha: Array) -> tuple[Array, Array, Array, Trajectory]:
         new = problem.displaced(knots, jax.tree.map(lambda d: alpha * d, d))
-        terms, h = _merit(problem, new, eta, rho)
-        return terms, _worst(h, rows), new
+        costs, penalties, h = _merit(problem, new, eta, rho)
+        return costs, penalties, _worst(h, rows), new
 
     sizes = jnp.append(jnp.asarray(LADDER, d.u.dtype) * reach, 0.0)
-    merits, apart, candidates = jax.vmap(candidate)(sizes)
-    change = jnp.sum(merits - merits[-1], axis=1)
-    rounding = 10.0 * jnp.finfo(merits.dtype).eps * jnp.sum(jnp.abs(merits[-1]))
-    lowers = change <= 1e-4 * sizes * jnp.minimum(promised, 0.0) + rounding
+    costs, penalties, apart, candidates = jax.vmap(candidate)(sizes)
+    cheaper = jnp.sum(costs - costs[-1], axis=1)
+    change = cheaper + jnp.sum(penalties - penalties[-1], axis=1)
+    rounding = 10.0 * jnp.finfo(costs.dtype).eps * jnp.sum(jnp.abs(costs[-1]) + penalties[-1])
+    lowers = change <= ARMIJO * sizes * jnp.minimum(sum(promised), 0.0) + rounding
     lowers &= jnp.isfinite(change) & (apart <= jnp.maximum(2.0 * apart[-1], 1.0))
-    lowers = lowers.at[-1].set(True)
-    best = jnp.argmax(lowers)
+    falls = (promised[0] < 0.0) & (cheaper <= ARMIJO * sizes * promised[0]) & (apart <= funnel)
+    allowed = (lowers | falls).at[-1].set(True)
+    best = jnp.argmax(allowed)
     chosen: Trajectory = jax.tree.map(lambda z: z[best], candidates)
-    return sizes[best], chosen
+    return sizes[best], chosen, ~lowers[best] & (sizes[best] > 0.0)
 
 
 def _worst(h: Multipliers, rows: Multipliers) -> Array:
@@ -524,17 +544,22 @@ def _worst(h: Multipliers, rows: Multipliers) -> Array:
 
 def _merit(
     problem: Problem, knots: Trajectory, eta: Multipliers, rho: Array
-) -> tuple[Array, Multipliers]:
-    """c - rho sum log(slacks) + sum eta |h|, one term a stage, (K + 1,), and h."""
+) -> tuple[Array, Array, Multipliers]:
+    """c - rho sum log(slacks) and sum eta |h|, one term a stage, (K + 1,), and h."""
     values = problem.values(knots)
     r = problem.with_slack(values.constraints, knots.slack)
-    stages = jnp.sum(eta.dynamics * jnp.abs(values.defects), axis=-1)
-    stages = stages + jnp.sum(eta.constraints.stage * jnp.abs(r.stage), axis=-1)
-    logs = [
-        jnp.where(jnp.isinf(s), 0.0, jnp.log(s)) for s in jax.tree.leaves(slacks_of(problem, knots))
-    ]
-    for part in logs:
-        stages = stages - rho * (jnp.sum(part, axis=-1) if part.ndim > 1 else 0.0)
-    end = jnp.sum(eta.constraints.terminal * jnp.abs(r.terminal))
-    end = end - rho * sum(jnp.sum(part) for part in logs if part.ndim == 1)
-    return values.costs.at[:-1].add(stages).at[-1].add(end), Multipliers(values.defects, r)
+    penalties = jnp.append(
+        jnp.sum(eta.dynamics * jnp.abs(values.defects), axis=-1)
+        + jnp.sum(eta.constraints.stage * jnp.abs(r.stage), axis=-1),
+        jnp.sum(eta.constraints.terminal * jnp.abs(r.terminal)),
+    )
+    costs = values.costs
+    for slack in jax.tree.leaves(slacks_of(problem, knots)):
+        logs = jnp.where(jnp.isinf(slack), 0.0, jnp.log(slack))
+        at_stages = logs.ndim > 1  # else at the end
+        costs = (
+            costs.at[:-1].add(-rho * jnp.sum(logs, axis=-1))
+            if at_stages
+            else costs.at[-1].add(-rho * jnp.sum(logs))
+        )
+    return costs, penalties, Multipliers(values.defects, r)

@@ -117,7 +117,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
 
     stationarity = jnp.maximum(relative(dual.x, peaks[0], x), relative(dual.u, peaks[1], u))
     defects = (jnp.abs(model.h.dynamics) / x).max(initial=0.0)
-    rows, rows_end = row_scales(derivatives, scales)
+    rows, rows_end = row_scales(derivatives, scales, knots)
     r = model.h.constraints
     of_stage, of_end = jnp.abs(r.stage) / (rows + tiny), jnp.abs(r.terminal) / (rows_end + tiny)
     gap = sum(jnp.sum(part) for part in jax.tree.leaves(products(problem, knots, v)))
@@ -160,11 +160,19 @@ def slope_of(
     return Trajectory(gx[1:] + sign * multipliers.dynamics, gu, slack)
 
 
-def row_scales(derivatives: Derivatives, scales: Scales) -> tuple[Array, Array]:
-    """What rows of constraints change by as everything moves, (m,) and (m_end,)."""
+def row_scales(derivatives: Derivatives, scales: Scales, knots: Trajectory) -> tuple[Array, Array]:
+    """What rows of constraints change by as everything moves, and slacks: (m,) and (m_end,)."""
     both = jnp.concatenate([scales.x, scales.u])
     stage = (jnp.abs(derivatives.stage) @ both).max(axis=0, initial=0.0)
-    return stage, jnp.abs(derivatives.terminal) @ scales.x
+    end = jnp.abs(derivatives.terminal) @ scales.x
+    if knots.slack is None:
+        return stage, end
+    of_stage, of_end = knots.slack.stage.max(axis=0, initial=0.0), knots.slack.terminal
+    equalities = len(stage) - len(of_stage), len(end) - len(of_end)
+    return (
+        stage.at[equalities[0] :].max(of_stage),
+        end.at[equalities[1] :].max(of_end),
+    )
 
 
 def products(problem: Problem, knots: Trajectory, v: Sides) -> Sides:

@@ -63,6 +63,9 @@ STRICTER = 10.0
 NEGLIGIBLE = 0.03
 """Differences of cost below so many scales of costs do not count."""
 
+STRAGGLERS = 0.002
+"""Share of chains for which the polish of the others does not wait."""
+
 CHEAPER = 1e-3
 """A rollout is an improvement if it is cheaper by more than this share."""
 
@@ -416,16 +419,17 @@ class Search:
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 now = Chains(state, info, np.where(feasible, since, -1))
-                if self.question[0].polish is not None and not self._active(state):
+                if self.polish is not None and not self._waits(state):
                     total = stop
                 self._report(replace(stage, now=now, step=stop), before + stop)
         except KeyboardInterrupt:  # the chains as they were at the last report
             return False
         return True
 
-    def _active(self, state: State) -> bool:
-        """Whether the polish still moves any chain."""
-        return bool(np.any(gathered(state.polish.active & state.alive, self.mesh)))
+    def _waits(self, state: State) -> bool:
+        """Whether more than a share `STRAGGLERS` of the chains is still being polished."""
+        active = np.asarray(gathered(state.polish.active & state.alive, self.mesh))
+        return bool(active.sum() > STRAGGLERS * len(active))
 
     def _report_every(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""
