@@ -29,14 +29,15 @@ def _double():
 
 @pytest.mark.parametrize(("equalities", "inequalities"), [(2, 3), (0, 2), (2, 0)])
 def test_elimination_is_the_schur_complement(equalities, inequalities):
-    n, m, mu = 4, equalities + inequalities, 7.0
+    n, m = 4, equalities + inequalities
     rng = np.random.default_rng(m)
+    mu = rng.uniform(3.0, 30.0, m)  # a penalty for each row
     J, r, nu = rng.normal(size=(m, n)), rng.normal(size=m), rng.normal(size=m)
     slope, curvature = rng.normal(size=inequalities), rng.uniform(0.5, 50.0, inequalities)
     H, grad = 2.0 * np.eye(n), rng.normal(size=n)  # what the cost has to say about dz
     S = np.eye(m)[:, equalities:]  # d residual / d slack
     whole = np.hstack([J, S])
-    M = mu * whole.T @ whole
+    M = whole.T * mu @ whole
     M[:n, :n] += H
     M[n:, n:] += np.diag(curvature)
     full = whole.T @ (nu + mu * r) + np.concatenate([grad, slope])
