@@ -407,7 +407,7 @@ class Search:
         total = flow.iterations + self.settings.after
         before = self.stage.done - self.stage.step if self.family.alone else 0
         try:
-            while self.stage.step < total:
+            while self.stage.step < total and self._waits(self.stage.now.state):
                 stage, now = self.stage, self.stage.now
                 stop = min(stage.step + self._report_every(total), total)
                 state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
@@ -419,15 +419,18 @@ class Search:
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 now = Chains(state, info, np.where(feasible, since, -1))
-                if self.polish is not None and not self._waits(state):
-                    total = stop
                 self._report(replace(stage, now=now, step=stop), before + stop)
         except KeyboardInterrupt:  # the chains as they were at the last report
             return False
         return True
 
     def _waits(self, state: State) -> bool:
-        """Whether more than a share `STRAGGLERS` of the chains is still being polished."""
+        """Whether more than a share `STRAGGLERS` of the chains is still being polished.
+
+        It depends on the states alone, so a resumed solve ends where the whole one did.
+        """
+        if self.polish is None:
+            return True
         active = np.asarray(gathered(state.polish.active & state.alive, self.mesh))
         return bool(active.sum() > STRAGGLERS * len(active))
 
