@@ -24,6 +24,7 @@ from .method.schedules import Scale as Scale
 from .modelling import guesses as guesses
 from .modelling.terms import Terms as Terms
 from .physics.mjcf import from_mjcf as from_mjcf
+from .polish.interior_point import Polish as Polish
 from .problem.build import from_dynamics as from_dynamics
 from .problem.build import from_function as from_function
 from .problem.differentiators import Autodiff as Autodiff

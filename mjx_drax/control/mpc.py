@@ -398,14 +398,17 @@ def _held_residual(
 
 
 def _first(found: Chains, explorers: int, seed: int) -> Carried:
-    """The chains of a solve, the best ones as keepers; the explorers at all ages."""
+    """The chains of a solve, the best ones as keepers; the explorers at all ages.
+
+    They go on with the flow's tail, not with the polish.
+    """
     info, chains = found.info, len(found.cost)
     count = chains - explorers
     age = np.zeros(chains, np.int32)
     age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
     order = np.lexsort(ranking(info.cost, info.max_defect)[::-1])
     return Carried(
-        _rows(found.state, order),
+        replace(_rows(found.state, order), polish=()),
         jnp.int32(0),
         jnp.array(False),
         jnp.int32(count - 1),

@@ -28,6 +28,7 @@ _ROLES = {
     "jacobian": "a way to differentiate",
     "__call__": "a schedule",
     "rounds": "a setting of rollouts",
+    "tolerance": "a setting of the polish",
 }
 """What a part of a solver is, by an attribute that it has; parts of one role are exchangeable."""
 
@@ -152,7 +153,8 @@ def _changed(part: Any, path: list[str], name: str, text: str) -> Any:
 def _value(old: Any, kind: str, name: str, text: str) -> Any:
     """The text as a value of the kind that the field's annotation says."""
     role = next((method for method in _ROLES if hasattr(old, method)), None)
-    role = "jacobian" if "Differentiator" in kind else "rounds" if "Rollouts" in kind else role
+    by_kind = {"Differentiator": "jacobian", "Rollouts": "rounds", "Polish": "tolerance"}
+    role = next((method for word, method in by_kind.items() if word in kind), role)
     value = _literal(text)
     if role == "__call__" and not isinstance(value, str):
         return _schedule(name, text, value)

@@ -11,8 +11,12 @@ from builders import bouncing
 
 from mjx_drax import (
     DraxError,
+    GaussNewton,
+    Identity,
     Langevin,
+    Polish,
     Restarts,
+    Smoothed,
     Trajectory,
     from_function,
     from_program,
@@ -131,7 +135,8 @@ def attempt(costs, defects, label):
     n = len(costs)
     marks = label + jnp.arange(n)[:, None]
     state = State(marks, marks, marks, marks, (), marks, jnp.ones(n, bool), jnp.full(n, -1))
-    info = Info(jnp.asarray(costs, float), jnp.asarray(defects, float), jnp.zeros(n))
+    none = jnp.zeros(n)
+    info = Info(jnp.asarray(costs, float), jnp.asarray(defects, float), none, none)
     return Chains(state, info, label + np.arange(n))
 
 
@@ -151,7 +156,8 @@ def test_every_chain_keeps_the_best_that_was_found_for_it(kind):
 def test_a_langevin_is_one_attempt_as_it_stands():
     found = search(SHORT, chains=4)
     assert found.records[-1][0] == 60
-    again = search(Restarts(SHORT, descent=None, attempts=1), chains=4)
+    same = Restarts(SHORT, descent=None, attempts=1, polish=Polish(iterations=0))
+    again = search(same, chains=4)
     np.testing.assert_array_equal(found.chains.state.trajectory.u, again.chains.state.trajectory.u)
 
 
@@ -168,6 +174,9 @@ def test_a_langevin_is_one_attempt_as_it_stands():
         ({"rollouts": 3}, r"rollouts is 3: give Rollouts\(\) or None"),
         ({"rollouts": Rollouts(rounds=-1)}, "rollouts.rounds is -1"),
         ({"rollouts": Rollouts(iterations=0)}, "rollouts.iterations is 0"),
+        ({"polish": 1e-6}, r"polish is 1e-06: give Polish\(\) or None"),
+        ({"polish": Polish(0.0)}, "polish.tolerance is 0.0"),
+        ({"polish": Polish(iterations=-1)}, "polish.iterations is -1"),
     ],
 )
 def test_settings_that_are_refused(settings, words):
@@ -191,7 +200,7 @@ NO_ROLLOUTS = Rollouts(first=0, rounds=0)
 
 def test_rollouts_follow_where_f_has_kinks(balls):
     """The same dynamics with and without being told of the kink."""
-    solver = Restarts(attempts=1)
+    solver = Restarts(attempts=1, polish=Polish(iterations=0))
     plain, kinked = (solve(p, chains=16, solver=solver, record=10) for p in balls)
     assert not plain.feasible.any()
     assert kinked.feasible.mean() > 0.9
@@ -250,13 +259,25 @@ def test_settings_that_depend_on_the_problem(balls):
     smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
     assert (smooth.enough, smooth.heated, smooth.rollouts) == (0.95, True, NO_ROLLOUTS)
     assert (kinked.enough, kinked.heated, kinked.rollouts) == (0.1, False, Rollouts())
+    assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(iterations=0))
+    sampled = replace(TINY, preconditioner=GaussNewton(derivatives=Smoothed()))
+    for flow in (sampled, replace(TINY, preconditioner=Identity())):
+        assert Restarts(flow).for_problem(balls[0]).polish == Polish(iterations=0)
+    with jax.enable_x64(True):
+        assert Restarts().for_problem(bouncing(kinked=None)).polish == Polish(1e-8)
     solver = Restarts(TINY, descent=4, attempts=2)
     found = solve(balls[1], chains=2, solver=solver).solver
-    assert found == replace(solver, enough=0.1, heated=False, rollouts=Rollouts())
+    rest = {"rollouts": Rollouts(), "polish": Polish(iterations=0)}
+    assert found == replace(solver, enough=0.1, heated=False, **rest)
 
 
 def test_no_setting_of_the_users_is_replaced(balls):
-    given = {"enough": 2.0, "heated": True, "rollouts": Rollouts(first=1, rounds=3, iterations=1)}
+    given = {
+        "enough": 2.0,
+        "heated": True,
+        "rollouts": Rollouts(first=1, rounds=3, iterations=1),
+        "polish": Polish(iterations=0),
+    }
     for ball in balls:
         solver = Restarts(TINY, descent=5, attempts=2, **given)
         found = solve(ball, chains=2, solver=solver)

@@ -13,6 +13,7 @@ from mjx_drax import (
     Geometric,
     Identity,
     Langevin,
+    Polish,
     Restarts,
     Rollouts,
     Smoothed,
@@ -30,6 +31,8 @@ from mjx_drax.search.settings import changed, from_data, names, to_data
         ("enough", "0.5", 0.5),
         ("heated", "False", False),
         ("rollouts", "Rollouts(rounds=4)", Rollouts(rounds=4)),
+        ("polish", "Polish(tolerance=1e-6)", Polish(1e-6)),
+        ("polish", "None", None),
         ("flow.iterations", "20", 20),
         ("flow.adjusted", "True", True),
         ("flow.noise", "0.5", Constant(0.5)),
@@ -78,6 +81,7 @@ def test_an_end_that_was_final_stays_so():
         ("heated", "1", "give True or False or None"),
         ("enough", "most", "give a number or None"),
         ("rollouts", "Identity", "rollouts is 'Identity': give one of Rollouts, or MODULE"),
+        ("polish", "1e-6", "polish is '1e-6': give one of Polish, or MODULE"),
         ("flow.noise", "hot", r"give a number, Geometric\(start, end\)"),
         ("flow.noise.start", "hot", "give a number"),
         ("flow.preconditioner", "Newton", "give one of Diagonal, GaussNewton, Identity, LBFGS"),
@@ -89,7 +93,8 @@ def test_what_is_refused(name, text, words):
 
 
 @pytest.mark.parametrize(
-    "solver", [Restarts(), Langevin(preconditioner=Identity(), noise=Constant(0.2))]
+    "solver",
+    [Restarts(polish=Polish(1e-6, 50)), Langevin(preconditioner=Identity(), noise=Constant(0.2))],
 )
 def test_there_and_back(solver):
     assert from_data(json.loads(json.dumps(to_data(solver)))) == solver
