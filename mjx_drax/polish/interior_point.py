@@ -38,6 +38,7 @@ from mjx_drax.method.model import Model, Multipliers, QuadraticCost
 from mjx_drax.method.riccati import newton
 from mjx_drax.polish.curvature import with_exact_hessian
 from mjx_drax.polish.residual import (
+    GAP,
     STILL,
     Residual,
     Scales,
@@ -62,6 +63,10 @@ LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 
 TRIES = 3
 """Factorizations in one iteration, with more damping each time."""
+
+PROMISED = 1.0
+"""Share of the last model's promise that the residual is at least: where the cost is flat, a small
+slope may still be far from the optimum."""
 
 NEAR = 0.02
 """Residual below which stages learn curvature."""
@@ -109,6 +114,7 @@ class Progress:
         secant: what stages have learned; () where Hessians are exact.
         residual: of the knots where derivatives were taken last.
         size: of the last step.
+        promise: what the last model promised to gain, relative to the cost.
         funnel: up to where h, relative to the scales of its rows, may grow while the cost falls.
         iterations: how many steps were looked for.
         optimal: the residual is below the tolerance, and the chain stands still.
@@ -122,6 +128,7 @@ class Progress:
     secant: Any
     residual: Array
     size: Array
+    promise: Array
     funnel: Array
     iterations: Array
     optimal: Array
@@ -145,6 +152,7 @@ def begin(problem: Problem, state: State) -> State:
         secant=() if problem.dynamics.twice else Secant.none(problem),
         residual=jnp.full((), jnp.inf, zero.dtype),
         size=zero,
+        promise=1.0 + zero,
         funnel=1.0 + zero,
         iterations=jnp.zeros((), int),
         optimal=no,
@@ -174,13 +182,9 @@ def step(
             state.multipliers,
             learns=before.size > 0.0,
         )
-    optimal = before.optimal | (residual.total < polish.tolerance)
-    now = replace(
-        before,
-        secant=learned,
-        residual=residual.total,
-        optimal=optimal,
-    )
+    total = jnp.maximum(residual.total, PROMISED * before.promise)
+    optimal = before.optimal | (total < polish.tolerance)
+    now = replace(before, secant=learned, residual=total, optimal=optimal)
     stays = ~before.active | optimal | last
     entered = _entered(problem, state, model, now, scales, guided)
     moved = _moved(problem, state, model, now, residual, scales, polish)
@@ -308,6 +312,7 @@ def _moved(
         stiffness=stiffness,
         penalties=jax.tree.map(lambda a, b: jnp.where(ok, a, b), eta, now.penalties),
         size=alpha,
+        promise=jnp.where(ok, jnp.abs(promised[0]) / scales.cost, now.promise),
         funnel=jnp.where(parts, NARROWER * now.funnel, now.funnel),
         iterations=now.iterations + 1,
         stalled=after > MOST,
@@ -337,12 +342,12 @@ def _barrier(
     """
     gaps = jax.tree.leaves(products(problem, knots, v))
     count = jnp.maximum(sum((jnp.sum(p > 0.0) for p in gaps), start=jnp.zeros((), int)), 1)
-    floor = 0.1 * polish.tolerance * scales.cost / count
+    floor = 0.1 * polish.tolerance * scales.cost / (GAP * count)
     others = residual.others
     for _ in range(2):
         off = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in gaps]
         centred = jnp.max(jnp.stack(off)) < 10.0 * rho
-        small = (others < NEAR) & (others < count * rho / scales.cost)
+        small = (others < NEAR) & (others < GAP * count * rho / scales.cost)
         lower = jnp.minimum(0.2 * rho, scales.terms * (rho / scales.terms) ** 1.5)
         falls = centred & ((residual.error < 10.0 * rho) | small)
         rho = jnp.where(falls, jnp.maximum(lower, floor), rho)

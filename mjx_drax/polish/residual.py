@@ -6,7 +6,7 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
                                           motion, of the absolute values of the terms in it
     defects             h = 0             relative to how far each coordinate of the state moves
     constraints         r = 0             relative to what a row changes by as everything moves
-    complementarity     v slack = 0       summed over all bounds, relative to the cost
+    complementarity     v slack = 0       ten times their sum, relative to the cost
 
 and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
@@ -33,6 +33,9 @@ CURVED = 1e-2
 
 STILL = 1e-3
 """Share of the largest term below which the scale of others does not fall."""
+
+GAP = 10.0
+"""Factor on the gap: the slope promises more than the cost, where terminal weights are large."""
 
 REST = 1e-2
 """Share of the box of initial knots that a coordinate moves by at least."""
@@ -137,7 +140,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         stationarity,
         defects,
         jnp.maximum(of_stage.max(initial=0.0), of_end.max(initial=0.0)),
-        gap / cost,
+        GAP * gap / cost,
         error,
     ), scales
 
