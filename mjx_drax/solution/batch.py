@@ -34,7 +34,7 @@ from mjx_drax.solution.replay import (
     open_loop_is_better,
     plan_violations,
 )
-from mjx_drax.solution.results import RESIDUAL, statuses
+from mjx_drax.solution.results import statuses, tolerance_of
 from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances
 
 SHARE = 0.5
@@ -204,11 +204,16 @@ def solve_batch(
     )
     found = search.run()
     interrupted = search.stage.place < len(search.stage.todo)
-    return _certified(family, chains, found, interrupted, tolerances)
+    return _certified(family, settings, chains, found, interrupted, tolerances)
 
 
 def _certified(
-    family: Family, chains: int, found: Found, interrupted: bool, tolerances: Tolerances
+    family: Family,
+    settings: Restarts,
+    chains: int,
+    found: Found,
+    interrupted: bool,
+    tolerances: Tolerances,
 ) -> BatchSolution:
     """The best chain of every problem, replayed."""
     clock = time.perf_counter()
@@ -231,7 +236,7 @@ def _certified(
         chain_cost=cost,
         chain_defect=defect,
         chain_residual=np.reshape(info.residual, shape),
-        tolerance=RESIDUAL,
+        tolerance=tolerance_of(settings),
         best=best,
         interrupted=interrupted,
         tolerances=tolerances,

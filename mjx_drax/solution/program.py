@@ -31,7 +31,7 @@ from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.replay import plan_violations
-from mjx_drax.solution.results import RESIDUAL, statuses
+from mjx_drax.solution.results import statuses, tolerance_of
 from mjx_drax.solution.violations import Violation
 
 
@@ -200,7 +200,7 @@ def minimize(
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),
         residual=np.asarray(info.residual),
-        tolerance=RESIDUAL,
+        tolerance=tolerance_of(settings),
         died_at=np.asarray(state.died_at),
         interrupted=search.stage.place < len(search.stage.todo),
     )

@@ -47,7 +47,7 @@ OPTIMAL, FEASIBLE_ONLY, INFEASIBLE = "optimal", "feasible", "infeasible"
 DIVERGED, INTERRUPTED = "diverged", "interrupted"
 
 RESIDUAL = 1e-4
-"""Residual below which a chain counts as optimal."""
+"""Residual below which a chain counts as optimal that was not polished."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,6 +292,12 @@ def statuses(
         names = np.where(feasible, names, INTERRUPTED)
     found: list[str] = np.where(diverged, DIVERGED, names).tolist()
     return found
+
+
+def tolerance_of(settings: Restarts) -> float:
+    """Below which a residual is that of an optimum: the polish's tolerance, if there is one."""
+    polish = settings.polish
+    return float(np.asarray(polish.tolerance)) if polish and polish.iterations else RESIDUAL
 
 
 def optimality(residual: float, tolerance: float) -> str:

@@ -113,7 +113,9 @@ def test_own_model_is_certified_and_written(own, capsys):
     assert "NOT CERTIFIED" not in out
     result = json.loads((own / "out" / "result.json").read_text())
     assert result["task"] == "slider"
-    assert (result["chains"], result["seed"], result["iterations"]) == (4, 3, 32)
+    assert (result["chains"], result["seed"]) == (4, 3)
+    assert 20 < result["iterations"] < 60  # 20 to descend, and then as many as the polish needs
+    assert result["residual"] < result["tolerance"] == 1e-4
     assert result["max_defect"] < 1e-3
     assert result["max_bound_violation"] == 0
     assert result["success_rate"] == 1.0
@@ -147,7 +149,7 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "NOT CERTIFIED" in out
     assert "constraints    largest violations: control bounds 0.0e+00 (tolerated: 1.0e-02)" in out
-    assert "optimality     residual not known" in out
+    assert re.search(r"optimality     residual [\d.e-]+, below 0.0001", out)
     assert "there from an earlier solve: replay.csv\n" in out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]
     assert not (tmp_path / "video.mp4").exists()

@@ -18,6 +18,8 @@ from mjx_drax import (
     Geometric,
     Identity,
     Langevin,
+    Polish,
+    Restarts,
     Trajectory,
     from_function,
 )
@@ -155,6 +157,32 @@ def test_hs071_and_its_multipliers_are_those_of_the_book_and_of_scipy():
     np.testing.assert_allclose(found.best, reference.x, atol=1e-3)
     np.testing.assert_allclose(found.equality[best], reference.v[0], atol=1e-3)
     np.testing.assert_allclose(found.inequality[best], reference.v[1], atol=1e-3)
+
+
+def _slopes_at(x):
+    """Slopes of cost, equality and inequality of hs071."""
+    parts = hs071()
+    names = "cost", "equality", "inequality"
+    return [np.ravel(jax.jacobian(parts[name])(jnp.asarray(x))) for name in names]
+
+
+def test_the_polish_goes_to_the_tolerance_of_the_precision_or_to_the_one_given():
+    """hs071 to all digits of the book; what is optimal is judged by the same tolerance."""
+    program = from_program(4, **hs071(), bounds=(1.0, 5.0))
+    found = minimize(program, chains=4)
+    assert found.tolerance == 1e-8
+    assert found.status == 4 * ["optimal"]
+    best = found.best_chain  # there is a second local optimum
+    np.testing.assert_allclose(found.x[best], [1.0, 4.7429994, 3.8211503, 1.3794082], atol=1e-6)
+    np.testing.assert_allclose(found.cost[best], 17.0140173, atol=1e-6)
+    forces = found.equality[best, 0], found.inequality[best, 0]
+    slope, of_equality, of_inequality = _slopes_at(found.x[best])
+    left = slope + of_equality * forces[0] + of_inequality * forces[1]
+    np.testing.assert_allclose(left[1:], 0.0, atol=1e-6)  # x_0 lies on its bound,
+    assert left[0] > 0.1  # which pushes back
+    loose = minimize(program, chains=4, solver=Restarts(polish=Polish(1e-3)))
+    assert loose.tolerance == 1e-3
+    assert ((loose.residual > 1e-8) & (loose.residual < 1e-3)).all()
 
 
 def test_noise_finds_the_global_minimum_of_several():

@@ -118,7 +118,9 @@ def test_title_tells_what_the_replays_did(pendulum: Solution) -> None:
     lines = plotting._title(pendulum).split("\n")
     chain = pendulum.best_chain
     assert f"cost {pendulum.replay_cost[chain]:.4g} (plan {pendulum.cost[chain]:.4g})" in lines[1]
-    assert "residual not known" in lines[1]
+    assert f"residual {pendulum.residual[chain]:.1e}, below 0.0001" in lines[1]
+    unknown = replace(pendulum, residual=np.full(8, np.nan))
+    assert "residual not known" in plotting._title(unknown)
     assert lines[0] == f"{pendulum.problem.name}: {pendulum.verdict}"
     assert f"max|h| {pendulum.max_defect[chain]:.1g}" in lines[1]
     assert f"{pendulum.success_rate:.0%} of 8 chains" in lines[1]
