@@ -170,17 +170,14 @@ def step(
     it measures the residual of where the chain ends. Where a flow has `guided` the chain, its
     barrier's weight goes on from that of the flow.
     """
-    before = state.polish
-    v = state.multipliers.bounds
+    before, v, derivatives = state.polish, state.multipliers.bounds, model.derivatives
+    assert v is not None  # for the type checker
+    assert derivatives is not None
     residual, scales = residual_of(problem, model, v)
     learned = before.secant
     if isinstance(learned, Secant):
         learned = learned.updated(
-            problem,
-            state.trajectory,
-            model.derivatives,
-            state.multipliers,
-            learns=before.size > 0.0,
+            problem, state.trajectory, derivatives, state.multipliers, learns=before.size > 0.0
         )
     total = jnp.maximum(residual.total, PROMISED * before.promise)
     optimal = before.optimal | (total < polish.tolerance)
@@ -247,14 +244,15 @@ def _moved(
     polish: Polish,
 ) -> State:
     """The chain after a step."""
-    assert model.derivatives is not None and state.multipliers.bounds is not None
-    knots, v = state.trajectory, state.multipliers.bounds
+    knots, v, derivatives = state.trajectory, state.multipliers.bounds, model.derivatives
+    assert v is not None  # for the type checker
+    assert derivatives is not None
     ends = slacks_of(problem, knots)
     rho = _barrier(problem, knots, v, now.barrier, residual, polish, scales)
 
     central = _central(problem, knots, rho)
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
-    cost = model.derivatives.cost
+    cost = derivatives.cost
     if isinstance(now.secant, Secant):
         near = residual.total < NEAR
         used = replace(now.secant, B=jnp.where(near, now.secant.B, 0.0))
@@ -287,9 +285,7 @@ def _moved(
     )
     of_cost, of_defects = _promised(model, d, left, eta)
     promised = of_cost - rho * _logs(ends, moves, reach), of_defects
-    rows = Multipliers(
-        scales.x, Stagewise(*row_scales(model.derivatives, scales, model.trajectory))
-    )
+    rows = Multipliers(scales.x, Stagewise(*row_scales(derivatives, scales, model.trajectory)))
     alpha, X, parts = _line_search(problem, model, d, reach, eta, rho, promised, rows, now.funnel)
     found = ok & (alpha > 0.0)
     alpha = jnp.where(found, alpha, 0.0)
@@ -477,11 +473,11 @@ def _promised(
     assert model.derivatives is not None
     gradient = model.derivatives.cost
     of_cost = jnp.sum(gradient.gx[1:] * d.x) + jnp.sum(gradient.gu * d.u)
-    of_defects = sum(
+    changes = [
         jnp.sum(e * (jnp.abs(after) - jnp.abs(before)))
         for e, after, before in zip(*map(jax.tree.leaves, (eta, left, model.h)), strict=True)
-    )
-    return of_cost, of_defects
+    ]
+    return of_cost, sum(changes, jnp.zeros(()))
 
 
 def _logs(ends: Sides, moves: Trajectory, reach: Array) -> Array:
