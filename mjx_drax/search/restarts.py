@@ -95,7 +95,7 @@ class Restarts:
             iterations=150,
             tail=60,
             noise=Geometric(6.0, 1.5e-3),
-            penalty=Geometric(40.0, 400.0),
+            penalty=Geometric(40.0, 400.0, 4e3),
             damping=Geometric(0.3, 0.1, 0.03),
             barrier_weight=Geometric(0.1, 1e-3, 1e-5),
         )
