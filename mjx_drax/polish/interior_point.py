@@ -38,7 +38,6 @@ from mjx_drax.method.model import Model, Multipliers, QuadraticCost
 from mjx_drax.method.riccati import newton
 from mjx_drax.polish.curvature import with_exact_hessian
 from mjx_drax.polish.residual import (
-    GAP,
     STILL,
     Residual,
     Scales,
@@ -47,13 +46,16 @@ from mjx_drax.polish.residual import (
     row_scales,
     slacks_of,
 )
-from mjx_drax.polish.secant import Secant
+from mjx_drax.polish.secant import Secant, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
-ARMIJO, NARROWER = 1e-4, 0.7
-"""Share of what is promised that a step must bring, and factor on the funnel when it is used."""
+ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
+"""Share of what is promised that a step must bring; the first funnel, and the factor when used."""
+
+DAMPED = 1e-2
+"""First damping: with none, chains leap out of the basin that the flow has found."""
 
 LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
 """Sizes of steps that are tried at once, as shares of the way to the boundary."""
@@ -63,10 +65,6 @@ LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 
 TRIES = 3
 """Factorizations in one iteration, with more damping each time."""
-
-PROMISED = 1.0
-"""Share of the last model's promise that the residual is at least: where the cost is flat, a small
-slope may still be far from the optimum."""
 
 NEAR = 0.02
 """Residual below which stages learn curvature."""
@@ -146,14 +144,14 @@ def begin(problem: Problem, state: State) -> State:
     nothing = jax.tree.map(jnp.zeros_like, replace(state.multipliers, bounds=None))
     progress = Progress(
         barrier=zero,
-        damping=zero,
+        damping=DAMPED + zero,
         stiffness=0.1 / jnp.sqrt(jnp.finfo(zero.dtype).eps) + zero,
         penalties=nothing,
         secant=() if problem.dynamics.twice else Secant.none(problem),
         residual=jnp.full((), jnp.inf, zero.dtype),
         size=zero,
         promise=1.0 + zero,
-        funnel=1.0 + zero,
+        funnel=FUNNEL + zero,
         iterations=jnp.zeros((), int),
         optimal=no,
         stalled=no,
@@ -179,7 +177,7 @@ def step(
         learned = learned.updated(
             problem, state.trajectory, derivatives, state.multipliers, learns=before.size > 0.0
         )
-    total = jnp.maximum(residual.total, PROMISED * before.promise)
+    total = jnp.maximum(residual.total, before.promise)
     optimal = before.optimal | (total < polish.tolerance)
     now = replace(before, secant=learned, residual=total, optimal=optimal)
     stays = ~before.active | optimal | last
@@ -252,16 +250,14 @@ def _moved(
 
     central = _central(problem, knots, rho)
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
-    cost = derivatives.cost
+    cost, learned = derivatives.cost, None
     if isinstance(now.secant, Secant):
-        near = residual.total < NEAR
-        used = replace(now.secant, B=jnp.where(near, now.secant.B, 0.0))
-        cost = used.added(cost, problem.dynamics.ndx)
+        learned = jnp.where(residual.total < NEAR, now.secant.B, 0.0)
     else:
         cost = with_exact_hessian(problem, knots, state.multipliers, cost, Autodiff())
     diagonal, _ = _diagonal(cost, scales)
     ok, d, rates, left, gains, damping = _direction(
-        model, cost, diagonal, now.damping, now.stiffness
+        model, cost, learned, diagonal, now.damping, now.stiffness
     )
 
     # bounds: v slack = rho, linearized
@@ -338,12 +334,12 @@ def _barrier(
     """
     gaps = jax.tree.leaves(products(problem, knots, v))
     count = jnp.maximum(sum((jnp.sum(p > 0.0) for p in gaps), start=jnp.zeros((), int)), 1)
-    floor = 0.1 * polish.tolerance * scales.cost / (GAP * count)
+    floor = 0.1 * polish.tolerance * scales.cost / count
     others = residual.others
     for _ in range(2):
         off = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in gaps]
         centred = jnp.max(jnp.stack(off)) < 10.0 * rho
-        small = (others < NEAR) & (others < GAP * count * rho / scales.cost)
+        small = (others < NEAR) & (others < count * rho / scales.cost)
         lower = jnp.minimum(0.2 * rho, scales.terms * (rho / scales.terms) ** 1.5)
         falls = centred & ((residual.error < 10.0 * rho) | small)
         rho = jnp.where(falls, jnp.maximum(lower, floor), rho)
@@ -377,11 +373,16 @@ def _diagonal(cost: QuadraticCost, scales: Scales) -> tuple[tuple[Array, Array],
 def _direction(
     model: Model,
     cost: QuadraticCost,
+    learned: Array | None,
     diagonal: tuple[Array, Array],
     damping: Array,
     stiffness: Array,
 ) -> tuple[Array, Trajectory, Multipliers, Multipliers, Array, Array]:
-    """Whether there is one, the step d, the multipliers' step, h + J d, gains, and the damping."""
+    """Whether there is one, the step d, the multipliers' step, h + J d, gains, and the damping.
+
+    Curvature that stages have `learned` (K, n, n) is left out where it makes the model indefinite:
+    Gauss-Newton's alone never is, and needs no more damping.
+    """
     derivatives, multipliers = model.derivatives, model.multipliers
     assert derivatives is not None
     of_x, of_u = diagonal
@@ -393,10 +394,12 @@ def _direction(
     Hxx = whole.Hxx.at[1:].add(jax.vmap(jnp.diag)(curvature.x))
     Huu = whole.Huu + jax.vmap(jnp.diag)(curvature.u)
 
-    def solved(damping: Array) -> tuple[Array, Any, Any, Any]:
+    def solved(damping: Array, share: Array) -> tuple[Array, Any, Any, Any]:
         damped = QuadraticCost(
             gx, gu, Hxx + damping * jnp.diag(of_x), whole.Hux, Huu + damping * jnp.diag(of_u)
         )
+        if learned is not None:
+            damped = with_curvature(damped, share * learned)
         step = newton(derivatives.dynamics, damped, multipliers.dynamics, stiff)
         ds, rate = jax.vmap(lambda block, dz: slack_step(block, dz, penalties.stage))(
             stages, stage_steps(step.dx, step.du)
@@ -410,10 +413,11 @@ def _direction(
 
     def again(carry: Any) -> Any:
         _, damping, tries = carry
-        damping = jnp.where(tries > 0, jnp.maximum(MORE * damping, LEAST), damping)
-        return solved(damping), damping, tries + 1
+        at_once = 0 if learned is None else 1  # tries before there is more damping
+        damping = jnp.where(tries > at_once, jnp.maximum(MORE * damping, LEAST), damping)
+        return solved(damping, jnp.where(tries == 0, 1.0, 0.0)), damping, tries + 1
 
-    shapes = jax.eval_shape(solved, damping)
+    shapes = jax.eval_shape(solved, damping, damping)
     nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
     (ok, d, rates, gains), damping, _ = jax.lax.while_loop(
         lambda carry: ~carry[0][0] & (carry[2] < TRIES), again, (nothing, damping, 0)

@@ -6,7 +6,7 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
                                           motion, of the absolute values of the terms in it
     defects             h = 0             relative to how far each coordinate of the state moves
     constraints         r = 0             relative to what a row changes by as everything moves
-    complementarity     v slack = 0       ten times their sum, relative to the cost
+    complementarity     v slack = 0       summed over all bounds, relative to the cost
 
 and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
@@ -34,8 +34,9 @@ CURVED = 1e-2
 STILL = 1e-3
 """Share of the largest term below which the scale of others does not fall."""
 
-GAP = 10.0
-"""Factor on the gap: the slope promises more than the cost, where terminal weights are large."""
+STATES = 0.05
+"""Share of the states' slopes in the cost's size: where terminal weights are large, they promise
+many times what the cost is."""
 
 REST = 1e-2
 """Share of the box of initial knots that a coordinate moves by at least."""
@@ -49,7 +50,7 @@ class Scales:
     Attributes:
         x, u: how far each coordinate moves, (ndx,) and (nu,).
         terms: the largest sum of terms of dL/dz, times how far the coordinate moves: a cost.
-        cost: sum |dc/dz| |z| over the motion.
+        cost: sum |dc/du| |u| + STATES sum |dc/dx| |x| over the motion.
     """
 
     x: Array
@@ -111,7 +112,8 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     ]
     terms = tiny + jnp.maximum((peaks[0] * x).max(initial=0.0), (peaks[1] * u).max(initial=0.0))
     gradient = derivatives.cost
-    cost = STILL * terms + jnp.sum(jnp.abs(gradient.gx[1:]) * x) + jnp.sum(jnp.abs(gradient.gu) * u)
+    of_x, of_u = jnp.sum(jnp.abs(gradient.gx[1:]) * x), jnp.sum(jnp.abs(gradient.gu) * u)
+    cost = STILL * terms + STATES * of_x + of_u
     scales = Scales(x, u, terms, cost)
 
     def relative(g: Array, peak: Array, extent: Array) -> Array:
@@ -140,7 +142,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         stationarity,
         defects,
         jnp.maximum(of_stage.max(initial=0.0), of_end.max(initial=0.0)),
-        GAP * gap / cost,
+        gap / cost,
         error,
     ), scales
 

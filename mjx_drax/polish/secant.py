@@ -81,16 +81,17 @@ class Secant:
         B = jnp.where(learns, learned, self.B)
         return Secant(B, J, g, x, knots.u)
 
-    def added(self, cost: QuadraticCost, ndx: int) -> QuadraticCost:
-        """The cost's model with the curvature that was learned."""
-        B = self.B
-        return QuadraticCost(
-            cost.gx,
-            cost.gu,
-            cost.Hxx.at[:-1].add(B[:, :ndx, :ndx]),
-            cost.Hux + B[:, ndx:, :ndx],
-            cost.Huu + B[:, ndx:, ndx:],
-        )
+
+def with_curvature(cost: QuadraticCost, B: Array) -> QuadraticCost:
+    """The cost's model with curvature B (K, n, n) added at its stages."""
+    ndx = cost.gx.shape[-1]
+    return QuadraticCost(
+        cost.gx,
+        cost.gu,
+        cost.Hxx.at[:-1].add(B[:, :ndx, :ndx]),
+        cost.Hux + B[:, ndx:, :ndx],
+        cost.Huu + B[:, ndx:, ndx:],
+    )
 
 
 def _rank_one(B: Array, H: Array, s: Array, y: Array, noise: Array) -> Array:
