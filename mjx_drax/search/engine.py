@@ -63,7 +63,7 @@ STRICTER = 10.0
 NEGLIGIBLE = 0.03
 """Differences of cost below so many scales of costs do not count."""
 
-STRAGGLERS = 0.002
+STRAGGLERS = 0.0005
 """Share of chains for which the polish of the others does not wait."""
 
 CHEAPER = 1e-3
