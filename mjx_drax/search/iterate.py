@@ -186,9 +186,13 @@ def _diagnosis(q: Question, state: State) -> Info:
 def diffused_or_polished(
     flow: Langevin, polish: Polish, problem: Problem, state: State, iteration: Array
 ) -> State:
-    """One iteration: a step of the flow while there is noise, then one of the polish."""
+    """One iteration: a step of the flow while there is noise, then one of the polish.
+
+    The penalty goes half its way; see `Restarts`.
+    """
     noisy, key = iteration < flow.iterations, jax.random.fold_in(state.key, iteration)
-    weights = flow.weights(jnp.minimum(flow.progress(iteration, True), 1.0))
+    t = jnp.minimum(flow.progress(iteration, True), 1.0)
+    weights = replace(flow.weights(t), penalty=flow.weights(0.5 * t).penalty)
     model = flow.model(problem, state, weights, key, tail=False)
     last = iteration + 1 == flow.iterations + polish.iterations
     new = jax.lax.cond(

@@ -86,8 +86,10 @@ class Restarts:
         heated: whether attempts after the first are heated, or descend like the first. None: unless
             f has kinks.
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
-        polish: what follows the noise, instead of the flow's tail. None: `Polish()` with the
-            tolerance of the precision, unless f has kinks or derivatives are sampled.
+        polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
+            flow's penalty goes half its way only: softer dynamics lead to better basins. None:
+            `Polish()` with the tolerance of the precision, unless f has kinks or derivatives are
+            sampled.
     """
 
     flow: Langevin = field(
@@ -95,7 +97,7 @@ class Restarts:
             iterations=150,
             tail=60,
             noise=Geometric(6.0, 1.5e-3),
-            penalty=Geometric(40.0, 400.0, 4e3),
+            penalty=Geometric(40.0, 4e3),
             damping=Geometric(0.3, 0.1, 0.03),
             barrier_weight=Geometric(0.1, 1e-3, 1e-5),
         )
