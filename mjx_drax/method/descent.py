@@ -47,10 +47,8 @@ class Info:
 
 def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     """The diagnostics of a trajectory whose functions have these values."""
-    outside, unknown = (
-        problem.bounds.violation(trajectory),
-        jnp.full((), jnp.nan, trajectory.u.dtype),
-    )
+    outside = problem.bounds.violation(trajectory)
+    unknown = jnp.full_like(outside, jnp.nan)
     return Info(values.cost, problem.worst(values), outside, unknown)
 
 

@@ -9,8 +9,8 @@ that is d = -M^{-1} grad L_mu with M = H + mu J'J, and samples of N(0, M^{-1}). 
 function 1/2 x'Px + p'x of the stages after k, minimizing over dx_{k+1} at a fixed
 y = h + A dx + B du gives e = S^{-1} (P y + p - lambda), S = mu I + P, and
 
-    P~ = mu S^{-1} P                          (so P~ -> P as mu -> infinity: ordinary LQR)
-    p~ = S^{-1} (mu p + P lambda)
+    P~ = mu S^{-1} P                          (P as mu -> infinity: ordinary LQR)
+    p~ = S^{-1} (mu p + P lambda)             computed with S / mu = I + P / mu, also for mu = inf
     Qxx = Hxx + A'P~A      Quu = Huu + B'P~B      Qux = Hux + B'P~A
     qx = gx + A'(P~h + p~)                    qu = gu + B'(P~h + p~)
     K = -Quu^{-1} Qux      kff = -Quu^{-1} qu     P <- Qxx + Qux'K      p <- qx + Qux'kff
@@ -48,7 +48,7 @@ class Factorization:
     """What the backward recursion leaves at every stage.
 
     K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky factors
-    of Quu and S; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
+    of Quu and S / mu; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
     """
 
     K: Array

@@ -10,11 +10,13 @@ is in units of a user's: D, the penalties of constraints and the barrier's weigh
 
     damping     raised until the factorization exists and a step is found, lowered after each
     step        the largest of a ladder, up to the boundary, that lowers the merit function
-                c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977, Powell)
-    barrier     rho falls when slopes and defects, as costs, are below ten times its value, and
-                rises where the boundary leaves only short steps
-    end         the `residual` is below the tolerance, and the chain stands still; or no step is
-                found however large the damping, and it has stalled
+                c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977, Powell),
+                or its first two terms, while h stays within a funnel that narrows
+    barrier     rho falls when its problem is nearly solved (`_barrier`), and rises where the
+                boundary leaves only short steps
+    end         the `residual`, and what the last model promised to gain, relative to the cost, are
+                below the tolerance, and the chain stands still; or no step is found however large
+                the damping, and it has stalled
 
 After J. Nocedal and S. Wright, Numerical Optimization, 2006, chapter 19, and A. Waechter and L.
 Biegler, On the implementation of an interior-point filter line-search algorithm, 2006.
@@ -64,10 +66,10 @@ LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 """Factors on the damping; damping below LEAST times `LESS`^8 is none, above MOST a chain stalls."""
 
 TRIES = 3
-"""Factorizations in one iteration, with more damping each time."""
+"""Factorizations in one iteration: without learned curvature, then with more damping each time."""
 
 NEAR = 0.02
-"""Residual below which stages learn curvature."""
+"""Residual below which the curvature that stages have learned is used."""
 
 BLOCKED, RAISE = 0.1, 3.0
 """Steps to the boundary shorter than BLOCKED raise the barrier's weight by a factor RAISE."""
@@ -110,7 +112,7 @@ class Progress:
         stiffness: kappa, of which the penalties of constraints are multiples.
         penalties: eta, shaped like lambda.
         secant: what stages have learned; () where Hessians are exact.
-        residual: of the knots where derivatives were taken last.
+        residual: of the knots where derivatives were taken last, or the last promise if larger.
         size: of the last step.
         promise: what the last model promised to gain, relative to the cost.
         funnel: up to where h, relative to the scales of its rows, may grow while the cost falls.

@@ -10,13 +10,13 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
 
 and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
-from. The cost is measured by what its slope promises over the motion, sum |dc/dz| |z|. So neither
-units nor constants that are added to the cost change the residual.
+from. The cost is measured by what its slope promises over the motion, sum |dc/du| |u| and a share of
+sum |dc/dx| |x|. So neither units nor constants that are added to the cost change the residual.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.bounds import Sides
 from mjx_drax.method.model import Derivatives, Model, Multipliers
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Stagewise, Trajectory
+from mjx_drax.problem.trajectory import Trajectory
 
 CURVED = 1e-2
 """Share of curvature times motion that a term counts as at least: at a perfect fit all vanish."""
@@ -94,8 +94,9 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     knots, tangent = model.trajectory, problem.dynamics.tangent
     below, above = (Trajectory(tangent(side.x), side.u, side.slack) for side in v)
     slope = slope_of(derivatives, multipliers, knots)
+    absolute = jax.tree.map(jnp.abs, replace(multipliers, bounds=None))
     dual = jax.tree.map(lambda g, a, b: g - a + b, slope, below, above)
-    sizes = slope_of(jax.tree.map(jnp.abs, derivatives), _absolute(multipliers), knots, 1.0)
+    sizes = slope_of(jax.tree.map(jnp.abs, derivatives), absolute, knots, 1.0)
     sizes = jax.tree.map(lambda s, a, b: s + a + b, sizes, below, above)
 
     box, offset = problem.scatter, jax.vmap(problem.dynamics.difference, (0, None))
@@ -201,9 +202,3 @@ def _moves(width: Array, offsets: Array) -> Array:
     floor = REST * (floor if floor.ndim == 1 else floor.max(axis=0))
     moves = jnp.maximum(jnp.abs(offsets).max(axis=0, initial=0.0), floor)
     return jnp.where(moves > 0.0, moves, 1.0)
-
-
-def _absolute(multipliers: Multipliers) -> Multipliers:
-    """lambda without signs."""
-    dynamics, rows = jnp.abs(multipliers.dynamics), multipliers.constraints
-    return Multipliers(dynamics, Stagewise(jnp.abs(rows.stage), jnp.abs(rows.terminal)))

@@ -8,7 +8,7 @@ After a step s = (dx_k, du_k), with the stage's Lagrangian l + lambda'f + nu'g a
 
 (the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984). It needs no derivatives
 beyond those that Gauss-Newton has anyway, so programs compile no longer for it. Far from an optimum
-what it learns is wrong one step later, so it begins near one.
+what stages have learned is wrong one step later, so it is used near one only.
 """
 
 from __future__ import annotations
