@@ -330,15 +330,16 @@ class MPC:
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
         """Plan in one launch, and use it if it is finite."""
         cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
-        scale = Scale(self._heated.scale.cost, np.float32(np.sqrt(max(cost, 1e-12))))
+        number = self._traced.x_init.dtype.type
+        scale = Scale(self._heated.scale.cost, number(np.sqrt(max(cost, 1e-12))))
         self._time = t  # of what is carried; the plan in use is older after one that failed
         self._carried, device = _plan(
             self._flow,
             replace(self._heated, scale=scale),
             self._traced,
             carried,
-            np.asarray(x, self._traced.x_init.dtype),
-            np.float32(by),
+            np.asarray(x, number),
+            number(by),
             np.int32(self.iterations),
             self.explorers,
         )
@@ -373,7 +374,7 @@ def holding(problem: Problem, hold: float) -> Problem:
     """The problem with hold dt phi(x) added to its running cost; hold [1/s] is traced."""
     if hold == 0.0:
         return problem
-    weight = np.float32(hold * problem.dynamics.dt)
+    weight = problem.x_init.dtype.type(hold * problem.dynamics.dt)
     running, terminal = problem.running, problem.terminal
     scalar, residual = running.scalar, running.residual
     if terminal.scalar is not None:

@@ -94,6 +94,21 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
     assert np.median(policy.statistics.max_defects) < 1e-4
 
 
+def test_float64_stays_float64():
+    with jax.enable_x64(True):
+        policy = MPC(balance(), chains=2, explorers=1, hold=1.0, solver=FAST)
+        policy.reset([0.5, 0.0])
+        x = np.array([0.5, 0.0])
+        for k in range(3):
+            x = stepped(x, policy(x, k * DT))
+        assert policy.statistics.failed == 0
+        assert {a.dtype for a in (policy.latest.x, policy.latest.u, policy.latest.gains)} == {
+            np.dtype(float)
+        }
+        weight = policy.problem.running.residual.args[-1]
+        assert weight == np.sqrt(DT)  # of `hold`, to the last bit
+
+
 def test_a_shift_by_one_knot_moves_all_that_is_carried():
     problem, flow, key = balance(), FAST.flow, jax.random.key(0)
     states = start(flow, problem, initial_knots(problem, 1, None, key), key)
