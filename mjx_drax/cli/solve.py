@@ -86,6 +86,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "state_bounds=1e-3,1e-2; relative=0.005 is the share of a scale of the problem's own for "
         "all others; again for more; a wrong name lists them all",
     )
+    add(
+        "--residual",
+        type=float,
+        metavar="R",
+        help="residual below which a chain is optimal and stops, the tolerance= of Python; "
+        "default 1e-4, in float64 1e-8",
+    )
+    add(
+        "--max-iterations",
+        type=at_least_1,
+        metavar="N",
+        help="of the polish that brings it there, after the noise; default 200",
+    )
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
@@ -107,7 +120,8 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.solution.solve import solve
     from mjx_drax.view.video import check as require_drawing
 
-    settled(problem, chains, options.seed, solver)  # refuses settings that cannot work
+    polish = {"tolerance": options.residual, "max_iterations": options.max_iterations}
+    settled(problem, chains, options.seed, solver, **polish)  # refuses what cannot work
     tolerances = _tolerances(options.tolerances)
     tolerances.of(problem)
     wanted = export.chosen(options)
@@ -135,6 +149,7 @@ def run(options: argparse.Namespace) -> int:
             record=1 if film else None,
             checkpoint=options.checkpoint,
             tolerances=tolerances,
+            **polish,
         )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]

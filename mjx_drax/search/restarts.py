@@ -205,9 +205,19 @@ def as_restarts(solver: Langevin | Restarts | None) -> Restarts:
 
 
 def settled(
-    problem: Problem, chains: int, seed: int, solver: Langevin | Restarts | None
+    problem: Problem,
+    chains: int,
+    seed: int,
+    solver: Langevin | Restarts | None,
+    tolerance: float | None = None,
+    max_iterations: int | None = None,
 ) -> Restarts:
     """The settings of a solve, checked, with a value for each that depends on the problem.
+
+    Args:
+        problem: what is solved.
+        chains, seed, solver: as in `solve`.
+        tolerance, max_iterations: of the polish; None: as the solver and the problem have it.
 
     Raises:
         DraxError: a number of chains, seed or setting that cannot work.
@@ -218,7 +228,33 @@ def settled(
         raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
     settings = as_restarts(solver)
     settings.check(problem)
-    return settings.for_problem(problem)
+    return _polished(settings, problem, tolerance, max_iterations).for_problem(problem)
+
+
+def _polished(
+    settings: Restarts, problem: Problem, tolerance: float | None, iterations: int | None
+) -> Restarts:
+    """The settings with another tolerance and number of iterations of the polish, if given."""
+    given: dict[str, Any] = {}
+    if tolerance is not None:
+        example = "1e-6; tolerances, plural, is for violations of replays"
+        require_positive("tolerance", tolerance, f"a number, such as {example}")
+        given["tolerance"] = float(tolerance)
+    if iterations is not None:
+        require_whole("max_iterations", iterations)
+        given["iterations"] = int(iterations)
+    if not given:
+        return settings
+    polish = settings.polish
+    if polish is not None and not polish.iterations:
+        name = "tolerance" if tolerance is not None else "max_iterations"
+        value = shown(tolerance if tolerance is not None else iterations)
+        raise DraxError(
+            f"{name} is {value}, which is for the polish, and this solver has none (a Langevin "
+            f"never has): leave {name} out, or give a Restarts with a polish."
+        )
+    usual = Polish(TOLERANCE[problem.x_init.dtype.itemsize])
+    return replace(settings, polish=replace(polish or usual, **given))
 
 
 def scale_of(cost: float, noise: float) -> Scale:

@@ -157,6 +157,8 @@ def solve_batch(
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
     tolerances: Tolerances | None = None,
+    tolerance: float | None = None,
+    max_iterations: int | None = None,
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
 
@@ -175,6 +177,7 @@ def solve_batch(
         checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
             there, as in `solve`.
         tolerances: by how much replays may break bounds and constraints; see `Tolerances`.
+        tolerance, max_iterations: of the polish, as in `solve`.
 
     Raises:
         DraxError: as `solve`; values without a common first axis; a problem with NaN, crossed
@@ -188,7 +191,7 @@ def solve_batch(
     family = Family.of(make, values)
     tolerances = as_tolerances(tolerances)
     tolerances.of(family.at(0))  # refuses those of another size
-    settings = settled(family.at(0), chains, seed, solver)
+    settings = settled(family.at(0), chains, seed, solver, tolerance, max_iterations)
     file = None if checkpoint is None else Checkpoint(checkpoint)
     size = chunk or (file and file.answered("chunk")) or fitting(family.at(0), chains)
     size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()

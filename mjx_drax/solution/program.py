@@ -159,8 +159,12 @@ def minimize(
     solver: Langevin | Restarts | None = None,
     guess: ArrayLike | None = None,
     progress: Progress | None = None,
+    tolerance: float | None = None,
+    max_iterations: int | None = None,
 ) -> Minimum:
     """Solve a program from `from_program`; `guess` (n,) or (chains, n) replaces random points.
+
+    The other arguments are those of `solve`.
 
     Raises:
         DraxError: sizes that misfit; functions that cannot be differentiated, or are finite, with
@@ -184,7 +188,7 @@ def minimize(
         u = jnp.asarray(given)[..., None, :]
         knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
     require_functions(progress=progress)
-    settings = settled(program, chains, seed, solver)
+    settings = settled(program, chains, seed, solver, tolerance, max_iterations)
     mesh = mesh_for(chains)
     search = Search(
         Family.of_one(program), chains, seed, settings, mesh=mesh, guess=knots, progress=progress

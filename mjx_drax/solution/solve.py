@@ -37,6 +37,8 @@ def solve(
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
     tolerances: Tolerances | None = None,
+    tolerance: float | None = None,
+    max_iterations: int | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
 
@@ -59,6 +61,10 @@ def solve(
             the same call was killed or ended by Ctrl-C. The answer is the same, bit for bit. A
             file that belongs to a complete solve gives its answer again; it may be deleted.
         tolerances: by how much replays may break bounds and constraints; see `Tolerances`.
+        tolerance: residual below which a chain is optimal and stops; by default 1e-4, and 1e-8 in
+            float64. It is for the optimality of plans, and `tolerances` for violations of replays.
+        max_iterations: most iterations of the polish that brings it there, in an attempt; by
+            default 200. Given either, chains are polished where by default they are not.
 
     Returns:
         the solution with its certificate; look at `solution.certified` and `solution.optimal`.
@@ -74,7 +80,7 @@ def solve(
     require_functions(progress=progress)
     tolerances = as_tolerances(tolerances)
     tolerances.of(problem)  # refuses those of another size
-    settings = settled(problem, chains, seed, solver)
+    settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
     recorder = None if record is None else Recorder(record)
     search = Search(
         Family.of_one(problem),

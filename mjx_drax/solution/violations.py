@@ -137,7 +137,10 @@ def as_tolerances(given: Tolerances | None) -> Tolerances:
     if given is None:
         return Tolerances()
     if not isinstance(given, Tolerances):
-        raise DraxError(f"tolerances are {shown(given)}: give mjx_drax.Tolerances(...).")
+        raise DraxError(
+            f"tolerances are {shown(given)}: give mjx_drax.Tolerances(...); tolerance, singular, "
+            "is for the residual."
+        )
     return given
 
 

@@ -1,5 +1,7 @@
 """Bad settings of a solve give one clear error, before anything iterates."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -12,11 +14,14 @@ from mjx_drax import (
     Geometric,
     Langevin,
     LogBarrier,
+    Polish,
     Restarts,
     Smoothed,
+    Tolerances,
     Trajectory,
     minimize,
     solve,
+    solve_batch,
 )
 from mjx_drax.search.settings import changed, from_data
 
@@ -35,6 +40,24 @@ SETTINGS = [
     ("solver-class", lambda at: solve(at.point, solver=Restarts), "solver is <class", "Restarts"),
     ("solver-0", lambda at: solve(at.point, solver=0), "solver is 0"),
     ("solver-dict", lambda at: solve(at.point, solver={"attempts": 3}), "solver is {'attempts'"),
+    ("tolerance-text", lambda at: solve(at.point, tolerance="1e-6"), "tolerance is '1e-6'"),
+    ("tolerance-0", lambda at: solve(at.point, tolerance=0), "tolerance is 0", "1e-6"),
+    ("tolerance-nan", lambda at: minimize(at.program, tolerance=NAN), "tolerance is nan"),
+    ("tolerance-violations", lambda at: solve(at.point, tolerance=Tolerances()),
+     "tolerance is Tolerances", "tolerances, plural"),
+    ("tolerance-langevin", lambda at: solve(at.point, solver=Langevin(), tolerance=1e-6),
+     "tolerance is 1e-06", "Langevin", "leave tolerance out"),
+    ("tolerances-number", lambda at: solve(at.point, tolerances=1e-6),
+     "tolerances are 1e-06", "tolerance, singular"),
+    ("max_iterations-half", lambda at: solve(at.point, max_iterations=0.5),
+     "max_iterations is 0.5"),
+    ("max_iterations-0", lambda at: solve(at.point, max_iterations=0), "max_iterations is 0"),
+    ("max_iterations-none-there",
+     lambda at: solve(at.point, solver=Restarts(polish=Polish(iterations=0)), max_iterations=9),
+     "max_iterations is 9", "leave max_iterations out"),
+    ("tolerance-batch",
+     lambda at: solve_batch(lambda x: replace(at.point, x_init=x), np.zeros((2, 2)), tolerance=-1),
+     "tolerance is -1"),
     ("iterations-half", lambda at: flow(iterations=1.5), "iterations is 1.5", "whole"),
     ("iterations-negative", lambda at: flow(iterations=-1), "iterations is -1"),
     ("iterations-none", lambda at: flow(iterations=None), "iterations is None"),

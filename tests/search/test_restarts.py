@@ -189,6 +189,31 @@ def test_a_solver_of_another_kind_is_refused():
         minimize(PROGRAM, chains=2, solver="ipopt")
 
 
+def test_a_tolerance_and_iterations_of_the_polish_are_arguments(balls):
+    problem, kinked = swing(), balls[1]
+    for solver, tolerance, iterations, found in (
+        (None, 1e-3, None, (1e-3, 200)),
+        (None, None, 7, (1e-4, 7)),
+        (Restarts(polish=Polish(1e-2, 50)), None, 9, (1e-2, 9)),
+        (Restarts(polish=Polish(1e-2, 50)), 1e-3, None, (1e-3, 50)),
+    ):
+        settings = settled(problem, 4, 0, solver, tolerance, iterations)
+        assert (settings.polish.tolerance, settings.polish.iterations) == found
+    assert settled(kinked, 4, 0, None).polish.iterations == 0
+    assert settled(kinked, 4, 0, None, 1e-3).polish == Polish(1e-3)
+
+
+def test_a_looser_tolerance_ends_sooner_and_judges_what_is_optimal():
+    once = partial(minimize, PROGRAM, chains=8, solver=Restarts(SHORT, attempts=1))
+    loose, tight = (once(tolerance=t) for t in (1e-1, 1e-4))
+    assert loose.tolerance == 1e-1
+    assert loose.optimal_chains.mean() > 0.5
+    assert tight.optimal_chains.mean() > 0.5
+    assert np.median(tight.residual) < 1e-4 < np.median(loose.residual)
+    few = once(max_iterations=2)
+    assert not few.optimal_chains.any()
+
+
 @pytest.fixture(scope="module")
 def balls():
     """The same bouncing ball without and with being told of the kink."""
