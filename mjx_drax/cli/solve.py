@@ -8,6 +8,7 @@ all bounds and constraints. It is optimal too if its residual is below a toleran
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -99,6 +100,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of the polish that brings it there, after the noise; default 200",
     )
+    add(
+        "--precision",
+        type=int,
+        choices=(32, 64),
+        help="bits of numbers: 64 makes and solves the problem in float64; default 32",
+    )
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
@@ -113,6 +120,14 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(options: argparse.Namespace) -> int:
     """Solve, save and draw; what cannot work is refused before anything compiles."""
+    import jax
+
+    with jax.enable_x64(True) if options.precision == 64 else nullcontext():
+        return _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
+    """The same, in the precision that JAX has now."""
     problem, solver, chains, draw = _asked(options)
     from mjx_drax.cli import summary
     from mjx_drax.search.restarts import settled
@@ -150,6 +165,7 @@ def run(options: argparse.Namespace) -> int:
             checkpoint=options.checkpoint,
             tolerances=tolerances,
             **polish,
+            precision=options.precision,
         )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]

@@ -10,6 +10,7 @@ are solved for. There is no hidden factor dt: a running cost is summed over knot
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -77,6 +78,15 @@ class Problem:
     def times(self) -> np.ndarray:
         """Times of x_0..x_K, (K + 1,) [s]."""
         return float(self.dynamics.dt) * np.arange(self.horizon + 1)
+
+    @property
+    def precision(self) -> int:
+        """Bits of its numbers: 32 or 64."""
+        return 8 * int(self.x_init.dtype.itemsize)
+
+    def arithmetic(self) -> AbstractContextManager[Any]:
+        """A context in which JAX keeps the problem's precision, whatever it is set to."""
+        return jax.enable_x64(True) if self.precision == 64 else nullcontext()
 
     # Of all that `observe` computes, these four keep what their readers read
 
@@ -216,7 +226,8 @@ class Problem:
         """
         limits = np.asarray(self.bounds.u_lower, float), np.asarray(self.bounds.u_upper, float)
         plan, u, gains = (np.asarray(given, float) for given in (plan, u, gains))
-        return self.dynamics.replay(plan, u, gains, limits)
+        with self.arithmetic():
+            return self.dynamics.replay(plan, u, gains, limits)
 
     def reached(self, x: np.ndarray) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.
@@ -241,7 +252,7 @@ class Problem:
         return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
 
     def in_float64(self) -> Problem:
-        """The same problem in float64, for use under `jax.enable_x64(True)`.
+        """The same problem in float64, as `solve(..., precision=64)` makes it.
 
         Numbers that were rounded to float32 stay so, except for those of a MuJoCo model. Functions
         are copied, since JAX keeps the precision in which it first saw their constant arrays; those
@@ -259,6 +270,25 @@ class Problem:
             )
             numbers = jax.tree.map(lambda leaf: jnp.asarray(in_double(leaf)), own)
         return with_host_fields(numbers, own)
+
+    def in_precision(self, bits: int | None) -> Problem:
+        """The same problem with numbers of 32 or 64 bits; None: those that it has.
+
+        Raises:
+            DraxError: other bits, or 32 for a problem that is in float64.
+        """
+        if bits is not None and (isinstance(bits, bool) or bits not in (32, 64)):
+            raise DraxError(
+                f"precision is {shown(bits)}: give 64 or 32, the bits of a number, or leave it out."
+            )
+        if bits is None or bits == self.precision:
+            return self
+        if bits == 32:
+            raise DraxError(
+                f"precision is 32, and {self.name} is in float64: leave precision out, or make the "
+                "problem without jax_enable_x64."
+            )
+        return self.in_float64()
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:
         """The same problem from another initial state (nx,).

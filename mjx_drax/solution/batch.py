@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -159,6 +159,7 @@ def solve_batch(
     tolerances: Tolerances | None = None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
+    precision: int | None = None,
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
 
@@ -177,7 +178,7 @@ def solve_batch(
         checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
             there, as in `solve`.
         tolerances: by how much replays may break bounds and constraints; see `Tolerances`.
-        tolerance, max_iterations: of the polish, as in `solve`.
+        tolerance, max_iterations, precision: as in `solve`.
 
     Raises:
         DraxError: as `solve`; values without a common first axis; a problem with NaN, crossed
@@ -189,25 +190,27 @@ def solve_batch(
     require_whole("chains", chains)
     require_functions(progress=progress)
     family = Family.of(make, values)
-    tolerances = as_tolerances(tolerances)
-    tolerances.of(family.at(0))  # refuses those of another size
-    settings = settled(family.at(0), chains, seed, solver, tolerance, max_iterations)
-    file = None if checkpoint is None else Checkpoint(checkpoint)
-    size = chunk or (file and file.answered("chunk")) or fitting(family.at(0), chains)
-    size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()
-    search = Search(
-        family,
-        chains,
-        seed,
-        settings,
-        size=size,
-        mesh=mesh_for(size, devices),
-        checkpoint=file,
-        chunk_done=progress,
-    )
-    found = search.run()
-    interrupted = search.stage.place < len(search.stage.todo)
-    return _certified(family, settings, chains, found, interrupted, tolerances)
+    family = replace(family, problem=family.problem.in_precision(precision))
+    with family.problem.arithmetic():
+        tolerances = as_tolerances(tolerances)
+        tolerances.of(family.at(0))  # refuses those of another size
+        settings = settled(family.at(0), chains, seed, solver, tolerance, max_iterations)
+        file = None if checkpoint is None else Checkpoint(checkpoint)
+        size = chunk or (file and file.answered("chunk")) or fitting(family.at(0), chains)
+        size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()
+        search = Search(
+            family,
+            chains,
+            seed,
+            settings,
+            size=size,
+            mesh=mesh_for(size, devices),
+            checkpoint=file,
+            chunk_done=progress,
+        )
+        found = search.run()
+        interrupted = search.stage.place < len(search.stage.todo)
+        return _certified(family, settings, chains, found, interrupted, tolerances)
 
 
 def _certified(

@@ -182,7 +182,7 @@ def _trajectories(solution: Solution, everything: bool) -> dict[str, Any]:
         one, other = (getattr(replays, name)[chains] for replays in (open_loop, feedback))
         return np.where(is_open.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
-    plans = np.asarray(solution.problem.with_start(solution.trajectories))
+    plans = solution.plans
     return {
         "states": replayed("states"),
         "controls": replayed("controls"),

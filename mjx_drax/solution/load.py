@@ -11,10 +11,12 @@ import io
 import json
 import os
 import warnings
-from dataclasses import dataclass, field
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -61,6 +63,7 @@ def load(
             problem = _stand_in(summary, arrays)
         else:
             _require_same(problem, summary, arrays)
+            problem = _as_solved(problem, arrays)
         solution = _solution(cls, problem, summary, arrays)
         _require_consistent(solution, summary)
         return solution
@@ -265,6 +268,12 @@ class _Manifold(FunctionDynamics):
 
 def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
     """The problem as far as it was saved."""
+    double = arrays["problem.x_init"].dtype == np.float64
+    with jax.enable_x64(True) if double else nullcontext():
+        return _made(summary, arrays)
+
+
+def _made(summary: dict[str, Any], arrays: Arrays) -> Problem:
     x_init = jnp.asarray(arrays["problem.x_init"])
     stage, terminal = (
         arrays[f"solution.multipliers.constraints.{part}"].shape[-1]
@@ -361,9 +370,20 @@ def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> 
                 f"the problem {problem.name} has {label} = {given}, the saved solution of "
                 f"{summary['task']} has {saved}: give the problem that was solved."
             )
-    if not np.array_equal(np.asarray(problem.x_init), arrays["problem.x_init"]):
+    start = np.asarray(problem.x_init)
+    if not np.array_equal(start, arrays["problem.x_init"].astype(start.dtype)):
         raise DraxError(
             f"x_init of the problem {problem.name} is {np.asarray(problem.x_init).tolist()}, the "
             f"saved solution of {summary['task']} starts at {arrays['problem.x_init'].tolist()}: "
             "give the problem that was solved."
         )
+
+
+def _as_solved(problem: Problem, arrays: Arrays) -> Problem:
+    """The problem in the precision in which it was solved."""
+    x_init = arrays["problem.x_init"]
+    if problem.precision == 64 or x_init.dtype != np.float64:
+        return problem
+    double = problem.in_float64()
+    with double.arithmetic():
+        return replace(double, x_init=jnp.asarray(x_init))

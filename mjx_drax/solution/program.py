@@ -161,6 +161,7 @@ def minimize(
     progress: Progress | None = None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
+    precision: int | None = None,
 ) -> Minimum:
     """Solve a program from `from_program`; `guess` (n,) or (chains, n) replaces random points.
 
@@ -173,38 +174,48 @@ def minimize(
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
-    knots = None
-    if guess is not None:
-        size = program.dynamics.nu
-        try:
-            given = numbers(guess)
-        except (TypeError, ValueError) as error:
-            raise DraxError(f"guess is {shown(guess)}: give numbers, ({size},).") from error
-        if given.shape not in ((size,), (chains, size)):
-            raise DraxError(
-                f"guess has shape {given.shape}: give ({size},), or ({chains}, {size}) with one "
-                "for each chain."
-            )
-        u = jnp.asarray(given)[..., None, :]
-        knots = Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)
-    require_functions(progress=progress)
-    settings = settled(program, chains, seed, solver, tolerance, max_iterations)
-    mesh = mesh_for(chains)
-    search = Search(
-        Family.of_one(program), chains, seed, settings, mesh=mesh, guess=knots, progress=progress
-    )
-    found = search.run()
-    state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
-    multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
-    return Minimum(
-        program=program,
-        x=np.asarray(state.trajectory.u[:, 0]),
-        equality=multipliers[:, :rows],
-        inequality=multipliers[:, rows:],
-        cost=np.asarray(info.cost),
-        max_defect=np.asarray(info.max_defect),
-        residual=np.asarray(info.residual),
-        tolerance=tolerance_of(settings),
-        died_at=np.asarray(state.died_at),
-        interrupted=search.stage.place < len(search.stage.todo),
-    )
+    program = program.in_precision(precision)
+    with program.arithmetic():
+        knots = None if guess is None else _knots(guess, chains, program.dynamics.nu)
+        require_functions(progress=progress)
+        settings = settled(program, chains, seed, solver, tolerance, max_iterations)
+        mesh = mesh_for(chains)
+        search = Search(
+            Family.of_one(program),
+            chains,
+            seed,
+            settings,
+            mesh=mesh,
+            guess=knots,
+            progress=progress,
+        )
+        found = search.run()
+        state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
+        multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
+        return Minimum(
+            program=program,
+            x=np.asarray(state.trajectory.u[:, 0]),
+            equality=multipliers[:, :rows],
+            inequality=multipliers[:, rows:],
+            cost=np.asarray(info.cost),
+            max_defect=np.asarray(info.max_defect),
+            residual=np.asarray(info.residual),
+            tolerance=tolerance_of(settings),
+            died_at=np.asarray(state.died_at),
+            interrupted=search.stage.place < len(search.stage.todo),
+        )
+
+
+def _knots(guess: ArrayLike, chains: int, size: int) -> Trajectory:
+    """Initial points (size,) or (chains, size) as knots."""
+    try:
+        given = numbers(guess)
+    except (TypeError, ValueError) as error:
+        raise DraxError(f"guess is {shown(guess)}: give numbers, ({size},).") from error
+    if given.shape not in ((size,), (chains, size)):
+        raise DraxError(
+            f"guess has shape {given.shape}: give ({size},), or ({chains}, {size}) with one "
+            "for each chain."
+        )
+    u = jnp.asarray(given)[..., None, :]
+    return Trajectory(jnp.zeros((*u.shape[:-1], 0)), u)

@@ -115,7 +115,8 @@ def replays(
     tolerances: Tolerances | None = None,
 ) -> Replays:
     """Every chain's controls, applied from x_0 with the given feedback gains."""
-    plan = np.asarray(problem.with_start(trajectories), float)
+    with problem.arithmetic():
+        plan = np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
     ran = problem.replay(plan, u, gains)
     return judged(Family.of_one(problem), plan, u, ran, tolerances or Tolerances())

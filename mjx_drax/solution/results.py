@@ -142,6 +142,12 @@ class Results:
         return len(self.cost)
 
     @cached_property
+    def plans(self) -> np.ndarray:
+        """Planned states x_0..x_K of every chain, (chains, K + 1, nx)."""
+        x, start = self.trajectories.x, np.asarray(self.problem.x_init)
+        return np.concatenate([np.broadcast_to(start, (len(x), 1, len(start))), x], axis=1)
+
+    @cached_property
     def feasible(self) -> np.ndarray:
         """Whether max|h| < 1e-3, (chains,)."""
         return (self.max_defect < FEASIBLE) & (self.died_at < 0)
@@ -209,11 +215,9 @@ class Results:
         if self.feasible[chain]:
             return None
         found = [v for v in self.plan.of(chain) if "equality" in v.kind]
-        states = np.asarray(self.problem.with_start(self.trajectories), float)[chain]
+        plan, u = self.plans[chain].astype(float), np.asarray(self.trajectories.u[chain])
         try:
-            found.append(
-                largest_defect(self.problem, states, np.asarray(self.trajectories.u[chain]))
-            )
+            found.append(largest_defect(self.problem, plan, u))
         except DraxError:  # f is not there
             defect = float(np.nan_to_num(self.max_defect[chain], nan=np.inf))
             found.insert(0, Violation(DYNAMICS, defect, FEASIBLE, -1, -1))
@@ -324,8 +328,9 @@ def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, 
         return ()
     order = certified[np.argsort(solution.replay_cost[certified], kind="stable")]
     problem = solution.problem
-    still = FEASIBLE * scatter_widths(problem)[1]
-    group = cluster(problem.dynamics, solution.trajectories.x[order], tolerance, still)
+    with problem.arithmetic():
+        still = FEASIBLE * scatter_widths(problem)[1]
+        group = cluster(problem.dynamics, solution.trajectories.x[order], tolerance, still)
     return tuple(_optimum(solution, order[group == g]) for g in range(group.max() + 1))
 
 

@@ -25,7 +25,6 @@ from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.source import binary
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.settings import to_data
 from mjx_drax.solution.results import Optimum, Results
 
@@ -56,6 +55,7 @@ def summary(solution: Results) -> dict[str, Any]:
         "chains": solution.chains,
         "iterations": solution.iterations,
         "horizon": solution.problem.horizon,
+        "precision": solution.problem.precision,
         "dt": float(solution.problem.dynamics.dt),
         "has_goal": solution.problem.goal is not None,
         "contacts": dynamics.contacts if isinstance(dynamics, MjxDynamics) else None,
@@ -109,7 +109,6 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
     """
     best = solution.best_chain
     ways = np.array([optimum.chain for optimum in solution.optima[:OPTIMA]], int)
-    plans = Trajectory(solution.trajectories.x[ways], solution.trajectories.u[ways])
     optimum_of = np.full(solution.chains, -1)
     for place, optimum in enumerate(solution.optima):
         optimum_of[optimum.members] = place
@@ -117,7 +116,7 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
     return {
         **_whole(solution),
         "times": solution.problem.times,
-        "states": np.asarray(solution.problem.with_start(solution.best)),
+        "states": solution.plans[best],
         "controls": np.asarray(solution.best.u),
         "multipliers": solution.multipliers.dynamics[best],
         "constraint_multipliers": solution.multipliers.constraints.stage[best],
@@ -125,8 +124,8 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
         "gains": solution.gains[best],
         "replayed_states": replayed_states,
         "replayed_controls": replayed_controls,
-        "optima_states": np.asarray(solution.problem.with_start(plans)),
-        "optima_controls": plans.u,
+        "optima_states": solution.plans[ways],
+        "optima_controls": solution.trajectories.u[ways],
         "chain_optimum": optimum_of,
         "chain_cost": solution.cost,
         "chain_max_defect": solution.max_defect,

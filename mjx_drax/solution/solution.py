@@ -57,7 +57,7 @@ class Solution(Results):
         """
         problem, u = self.problem, np.asarray(self.trajectories.u)
         chosen = self.tolerances if tolerances is None else as_tolerances(tolerances)
-        plan = np.asarray(problem.with_start(self.trajectories), float)
+        plan = self.plans.astype(float)
         ran = both_ways(Family.of_one(problem), plan, u, self.gains, chosen)
         engine = problem.dynamics.engine
         return replace(self, open_loop=ran[0], feedback=ran[1], tolerances=chosen, engine=engine)

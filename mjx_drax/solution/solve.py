@@ -39,6 +39,7 @@ def solve(
     tolerances: Tolerances | None = None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
+    precision: int | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
 
@@ -65,6 +66,8 @@ def solve(
             float64. It is for the optimality of plans, and `tolerances` for violations of replays.
         max_iterations: most iterations of the polish that brings it there, in an attempt; by
             default 200. Given either, chains are polished where by default they are not.
+        precision: 64: in float64, whatever JAX is set to; see `Problem.in_float64` for what that
+            asks of the problem. 32: in float32. None: in the precision of the problem.
 
     Returns:
         the solution with its certificate; look at `solution.certified` and `solution.optimal`.
@@ -78,24 +81,26 @@ def solve(
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     require_functions(progress=progress)
-    tolerances = as_tolerances(tolerances)
-    tolerances.of(problem)  # refuses those of another size
-    settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
-    recorder = None if record is None else Recorder(record)
-    search = Search(
-        Family.of_one(problem),
-        chains,
-        seed,
-        settings,
-        mesh=mesh_for(chains, devices),
-        guess=guess,
-        checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
-        recorder=recorder,
-        progress=progress,
-    )
-    found = search.run()
-    interrupted = search.stage.place < len(search.stage.todo)
-    solution = _certified(problem, settings, seed, found, interrupted, tolerances)
+    problem = problem.in_precision(precision)
+    with problem.arithmetic():
+        tolerances = as_tolerances(tolerances)
+        tolerances.of(problem)  # refuses those of another size
+        settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
+        recorder = None if record is None else Recorder(record)
+        search = Search(
+            Family.of_one(problem),
+            chains,
+            seed,
+            settings,
+            mesh=mesh_for(chains, devices),
+            guess=guess,
+            checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
+            recorder=recorder,
+            progress=progress,
+        )
+        found = search.run()
+        interrupted = search.stage.place < len(search.stage.todo)
+        solution = _certified(problem, settings, seed, found, interrupted, tolerances)
     return solution if recorder is None else replace(solution, recording=recorder.recording())
 
 

@@ -295,9 +295,10 @@ def measured(
         tolerances: what is tolerated.
     """
     dtype = family.problem.x_init.dtype
-    limits = tolerances.of(family.at(0)), tolerances.relative
-    given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
-    cost, found = _measured(*family.parts, *given)
+    with family.problem.arithmetic():
+        limits = tolerances.of(family.at(0)), tolerances.relative
+        given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+        cost, found = _measured(*family.parts, *given)
     size, allowed, entry, knot = (np.asarray(a) for a in found)
 
     def framed(values: np.ndarray, filling: float) -> np.ndarray:

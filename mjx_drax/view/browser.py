@@ -136,7 +136,7 @@ def _recorded(solution: Solution, ghosts: int) -> str:
     model = mujoco_model(solution.problem.dynamics)
     assert model is not None  # as checked
     states = finite(solution.replayed[0])
-    plan = np.asarray(solution.problem.with_start(solution.best), float)
+    plan = solution.plans[solution.best_chain].astype(float)
     replayed, planned = _motion(model, states), _motion(model, finite(plan))
     certificate = solution.certificate
     follows = certificate.open_loop if solution.replay_mode == OPEN_LOOP else certificate.feedback

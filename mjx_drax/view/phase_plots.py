@@ -59,7 +59,7 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
             f"{solution.problem.name} has no model and {dynamics.nx} states: which of them are "
             "velocities is unknown. Give one with a model, or with two states."
         )
-    plan = np.asarray(solution.problem.with_start(solution.best), float)
+    plan = solution.plans[solution.best_chain].astype(float)
     phases = [_phases(dynamics, states) for states in (plan, finite(solution.replayed[0]))]
     known = coordinates(dynamics)
     panels = [

@@ -88,7 +88,7 @@ def _draw_paths(axes: Axes, solution: Solution) -> None:
     grid = np.stack(np.meshgrid(side, side), axis=-1)
     shade = np.exp(-5.0 * np.square(grid[..., None, :] - task.WALL).sum(-1)).sum(-1)
     axes.contourf(side, side, shade, levels=20, cmap="Greys", vmax=1.6 * shade.max())
-    paths = np.asarray(solution.problem.with_start(solution.trajectories))
+    paths = solution.plans
     escaped = reaching(solution)
     styles: list[tuple[np.ndarray, str, dict[str, Any]]] = [
         (~solution.feasible, "0.7", {"lw": 0.3, "alpha": 0.4}),
