@@ -8,10 +8,11 @@ with Hessian H + V / S + delta D: Gauss-Newton's H with what stages have learned
 bounds' multipliers over slacks V / S, and damping relative to the model's own diagonal D. Nothing
 is in units of a user's: D, the penalties of constraints and the barrier's weight are all measured.
 
-    damping     raised until the factorization exists and a step is found, lowered after each
+    damping     raised until the factorization exists and a step is found, lowered after each; where
+                curvature is learned, short steps say that some is missing, and raise it too
     step        the largest of a ladder, up to the boundary, that lowers the merit function
-                c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977, Powell),
-                or its first two terms, while h stays within a funnel that narrows
+                c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977), or
+                its first two terms, while h stays within a funnel that narrows
     barrier     rho falls when its problem is nearly solved (`_barrier`), and rises where the
                 boundary leaves only short steps
     end         the `residual`, and what the last model promised to gain, relative to the cost, are
@@ -51,19 +52,27 @@ from mjx_drax.polish.residual import (
 from mjx_drax.polish.secant import Secant, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.rollout import follow
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
 ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
 """Share of what is promised that a step must bring; the first funnel, and the factor when used."""
 
 DAMPED = 1e-2
-"""First damping: with none, chains leap out of the basin that the flow has found."""
+"""First damping after a flow: with none, chains leap out of the basin that it has found."""
+
+STATES = 1e-2
+"""Damping of states beside that of controls: D is the largest along the motion, and often that of
+the end."""
 
 LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
 """Sizes of steps that are tried at once, as shares of the way to the boundary."""
 
 LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 """Factors on the damping; damping below LEAST times `LESS`^8 is none, above MOST a chain stalls."""
+
+HALF, SHORT = 0.5, 0.25
+"""Where curvature is learned: steps up to HALF keep the damping, steps up to SHORT raise it."""
 
 TRIES = 3
 """Factorizations in one iteration: without learned curvature, then with more damping each time."""
@@ -146,7 +155,7 @@ def begin(problem: Problem, state: State) -> State:
     nothing = jax.tree.map(jnp.zeros_like, replace(state.multipliers, bounds=None))
     progress = Progress(
         barrier=zero,
-        damping=DAMPED + zero,
+        damping=zero,
         stiffness=0.1 / jnp.sqrt(jnp.finfo(zero.dtype).eps) + zero,
         penalties=nothing,
         secant=() if problem.dynamics.twice else Secant.none(problem),
@@ -159,6 +168,22 @@ def begin(problem: Problem, state: State) -> State:
         stalled=no,
     )
     return replace(state, polish=progress)
+
+
+def projected(problem: Problem, state: State) -> State:
+    """The chain's controls with their feedback, and the states that follow: no defects are left.
+
+    Chains that soft dynamics have left between two motions, where bounds block all steps, take
+    one of them. A chain whose states do not stay finite keeps its knots.
+    """
+    knots = state.trajectory
+    lower, upper = problem.bounds.sides(replace(knots, slack=None))
+    x, u = follow(
+        problem.dynamics, problem.with_start(knots), knots.u, state.gains, (lower.u, upper.u)
+    )
+    finite = jnp.isfinite(x).all()
+    x, u = jnp.where(finite, x[1:], knots.x), jnp.where(finite, u, knots.u)
+    return replace(state, trajectory=replace(knots, x=x, u=u))
 
 
 def step(
@@ -184,8 +209,8 @@ def step(
     now = replace(before, secant=learned, residual=total, optimal=optimal)
     stays = ~before.active | optimal | last
     entered = _entered(problem, state, model, now, scales, guided)
-    moved = _moved(problem, state, model, now, residual, scales, polish)
     first = before.barrier == 0.0
+    moved = _moved(problem, state, model, now, residual, scales, polish, ~stays & ~first)
     new = jax.tree.map(lambda a, b: jnp.where(first, a, b), entered, moved)
     kept = replace(
         state, polish=jax.tree.map(lambda a, b: jnp.where(before.active, a, b), now, before)
@@ -203,8 +228,8 @@ def _entered(
     most = FIRST * jnp.maximum(scales.terms, STILL * largest)
     rho = jnp.where(guided, jnp.clip(model.weights.barrier, 1e-6 * scales.cost, most), most)
     v = _central(problem, knots, rho)
-    no = jnp.zeros((), bool)
-    now = replace(now, barrier=rho, size=jnp.zeros(()), optimal=no)
+    damping, no = jnp.where(guided, DAMPED, jnp.zeros(())), jnp.zeros((), bool)
+    now = replace(now, barrier=rho, damping=damping, size=jnp.zeros(()), optimal=no)
     multipliers = replace(state.multipliers, bounds=v)
     return replace(state, trajectory=knots, multipliers=multipliers, polish=now)
 
@@ -242,8 +267,9 @@ def _moved(
     residual: Residual,
     scales: Scales,
     polish: Polish,
+    needed: Array,
 ) -> State:
-    """The chain after a step."""
+    """The chain after a step, where one is `needed`."""
     knots, v, derivatives = state.trajectory, state.multipliers.bounds, model.derivatives
     assert v is not None  # for the type checker
     assert derivatives is not None
@@ -259,7 +285,7 @@ def _moved(
         cost = with_exact_hessian(problem, knots, state.multipliers, cost, Autodiff())
     diagonal, _ = _diagonal(cost, scales)
     ok, d, rates, left, gains, damping = _direction(
-        model, cost, learned, diagonal, now.damping, now.stiffness
+        model, cost, learned, diagonal, now.damping, now.stiffness, needed
     )
 
     # bounds: v slack = rho, linearized
@@ -268,7 +294,7 @@ def _moved(
         jax.tree.map(lambda c, v, s, m: c - v - v * m / s, central[0], v[0], ends[0], moves),
         jax.tree.map(lambda c, v, s, m: c - v + v * m / s, central[1], v[1], ends[1], moves),
     )
-    share = jnp.maximum(0.99, 1.0 - rho / scales.terms)
+    share = jnp.clip(1.0 - rho / scales.terms, 0.99, 1.0 - jnp.finfo(rho.dtype).eps ** 0.5)
     reach = jnp.minimum(
         _largest(ends[0], moves, share), _largest(ends[1], jax.tree.map(jnp.negative, moves), share)
     )
@@ -293,7 +319,11 @@ def _moved(
     v = jax.tree.map(lambda v, dv: v + jnp.where(found, size_v * dv, 0.0), v, dv)
     v = _held(problem, X, v, rho)
     lower = jnp.where(damping * LESS < LEAST * LESS**8, 0.0, damping * LESS)
-    after = jnp.where(found, lower, jnp.maximum(MORE * damping, LEAST))
+    higher = jnp.maximum(MORE * damping, LEAST)
+    if learned is not None:
+        kept = jnp.where(alpha > SHORT * reach, damping, higher)
+        lower = jnp.where(alpha > HALF * reach, lower, kept)
+    after = jnp.where(found, lower, higher)
     shortfall, present = _worst(left, rows), _worst(model.h, rows)
     loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
     most = 1e-2 / jnp.finfo(alpha.dtype).eps
@@ -379,11 +409,13 @@ def _direction(
     diagonal: tuple[Array, Array],
     damping: Array,
     stiffness: Array,
+    needed: Array,
 ) -> tuple[Array, Trajectory, Multipliers, Multipliers, Array, Array]:
     """Whether there is one, the step d, the multipliers' step, h + J d, gains, and the damping.
 
     Curvature that stages have `learned` (K, n, n) is left out where it makes the model indefinite:
-    Gauss-Newton's alone never is, and needs no more damping.
+    Gauss-Newton's alone never is, and needs no more damping. Where none is needed, none is
+    looked for: a batch takes as many tries as its chain that takes most.
     """
     derivatives, multipliers = model.derivatives, model.multipliers
     assert derivatives is not None
@@ -398,7 +430,11 @@ def _direction(
 
     def solved(damping: Array, share: Array) -> tuple[Array, Any, Any, Any]:
         damped = QuadraticCost(
-            gx, gu, Hxx + damping * jnp.diag(of_x), whole.Hux, Huu + damping * jnp.diag(of_u)
+            gx,
+            gu,
+            Hxx + STATES * damping * jnp.diag(of_x),
+            whole.Hux,
+            Huu + damping * jnp.diag(of_u),
         )
         if learned is not None:
             damped = with_curvature(damped, share * learned)
@@ -422,7 +458,7 @@ def _direction(
     shapes = jax.eval_shape(solved, damping, damping)
     nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
     (ok, d, rates, gains), damping, _ = jax.lax.while_loop(
-        lambda carry: ~carry[0][0] & (carry[2] < TRIES), again, (nothing, damping, 0)
+        lambda carry: needed & ~carry[0][0] & (carry[2] < TRIES), again, (nothing, damping, 0)
     )
     rows = rates.constraints
     of_rows = Stagewise(rows.stage / penalties.stage, rows.terminal / penalties.terminal)

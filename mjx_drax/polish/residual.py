@@ -10,8 +10,8 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
 
 and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
-from. The cost is measured by what its slope promises over the motion, sum |dc/du| |u| and a share of
-sum |dc/dx| |x|. So neither units nor constants that are added to the cost change the residual.
+from. The cost is measured by what its slope promises over the motion, sum |dc/du| |u| and a share
+of sum |dc/dx| |x|. So neither units nor constants that are added to it change the residual.
 """
 
 from __future__ import annotations

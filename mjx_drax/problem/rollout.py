@@ -64,18 +64,42 @@ def _replay(
     limits: tuple[Array, Array],
 ) -> tuple[Array, Array]:
     lower, upper = (jnp.broadcast_to(side, u.shape[1:]) for side in limits)
+    functions = partial(step, dynamics), partial(difference, dynamics)
+    return jax.vmap(partial(_followed, functions, limits=(lower, upper)))(plan, u, gains)
+
+
+def follow(
+    dynamics: Any, plan: Array, u: Array, gains: Array, limits: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The states x_0..x_K (K + 1, nx) and controls (K, nu) of one chain's plan under feedback.
+
+    Args:
+        dynamics: f and its arithmetic of states.
+        plan: planned states (K + 1, nx), of which the first is where it starts.
+        u: planned controls (K, nu).
+        gains: K_k in u_k + K_k (x_k - planned x_k), (K, nu, ndx).
+        limits: of controls, below and above, each (K, nu).
+    """
+    return _followed((dynamics.step, dynamics.difference), plan, u, gains, limits)
+
+
+def _followed(
+    functions: tuple[Callable[..., Array], Callable[..., Array]],
+    plan: Array,
+    u: Array,
+    gains: Array,
+    limits: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    step, difference = functions
 
     def advance(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
         planned, control, gain, low, high = stage
-        control = jnp.clip(control + gain @ difference(dynamics, x, planned), low, high)
-        x = step(dynamics, x, control)
+        control = jnp.clip(control + gain @ difference(x, planned), low, high)
+        x = step(x, control)
         return x, (x, control)
 
-    def chain(plan: Array, u: Array, gains: Array) -> tuple[Array, Array]:
-        states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, lower, upper))[1]
-        return jnp.concatenate([plan[:1], states]), applied
-
-    return jax.vmap(chain)(plan, u, gains)
+    states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, *limits))[1]
+    return jnp.concatenate([plan[:1], states]), applied
 
 
 def in_double(leaf: Any) -> Any:

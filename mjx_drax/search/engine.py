@@ -407,7 +407,7 @@ class Search:
         total = flow.iterations + self.settings.after
         before = self.stage.done - self.stage.step if self.family.alone else 0
         try:
-            while self.stage.step < total and self._waits(self.stage.now.state):
+            while self.stage.step < total and self._waits(self.stage.now):
                 stage, now = self.stage, self.stage.now
                 stop = min(stage.step + self._report_every(total), total)
                 state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
@@ -424,15 +424,36 @@ class Search:
             return False
         return True
 
-    def _waits(self, state: State) -> bool:
+    def _waits(self, now: Chains) -> bool:
         """Whether more than a share `STRAGGLERS` of the chains is still being polished.
 
-        It depends on the states alone, so a resumed solve ends where the whole one did.
+        Where another attempt will follow, chains far more expensive than the best do not count:
+        they start again. It depends on the chains alone, so a resumed solve ends where the whole
+        one did.
         """
-        if self.polish is None:
+        if self.polish is None or self.stage.step <= self.flow.iterations:
             return True
-        active = np.asarray(gathered(state.polish.active & state.alive, self.mesh))
+        active = np.asarray(gathered(now.state.polish.active & now.state.alive, self.mesh))
+        hopeful = self._hopeful(now)
+        if hopeful is not None:
+            active = active & hopeful
         return bool(active.sum() > STRAGGLERS * len(active))
+
+    def _hopeful(self, now: Chains) -> np.ndarray | None:
+        """Rows that are not far more expensive than the best; None if no attempt will follow."""
+        stage, settings, kept = self.stage, self.settings, self.stage.kept
+        if not self.family.alone or stage.attempt + 1 == settings.attempts:
+            return None
+        assert settings.enough is not None
+        costs, feasible = now.cost, now.feasible
+        if kept is not None:  # the best may be among them
+            costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.feasible)
+        near = finished(costs, feasible, settings.within, stage.cost_scale[0])
+        rows = len(now.cost)
+        hopeful = near[:rows] | ~now.feasible
+        done = np.zeros(self.chains, bool) if kept is None else near[rows:]
+        done[stage.owners[hopeful]] = True
+        return hopeful if (~done).sum() > (1.0 - settings.enough) * self.chains else None
 
     def _report_every(self, total: int) -> int:
         """Iterations up to the next report, for an attempt of so many."""

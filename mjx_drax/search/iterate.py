@@ -188,9 +188,15 @@ def diffused_or_polished(
 ) -> State:
     """One iteration: a step of the flow while there is noise, then one of the polish.
 
-    The penalty goes half its way; see `Restarts`.
+    The penalty goes half its way; see `Restarts`. Between the two the chain is projected.
     """
     noisy, key = iteration < flow.iterations, jax.random.fold_in(state.key, iteration)
+    guided = jnp.asarray(flow.iterations > 0)
+    state = jax.lax.cond(
+        guided & (iteration == flow.iterations),
+        lambda: interior_point.projected(problem, state),
+        lambda: state,
+    )
     t = jnp.minimum(flow.progress(iteration, True), 1.0)
     weights = replace(flow.weights(t), penalty=flow.weights(0.5 * t).penalty)
     model = flow.model(problem, state, weights, key, tail=False)
@@ -198,9 +204,7 @@ def diffused_or_polished(
     new = jax.lax.cond(
         noisy,
         lambda: flow.diffuse(problem, state, model, key),
-        lambda: interior_point.step(
-            problem, state, model, polish, last, guided=jnp.asarray(flow.iterations > 0)
-        ),
+        lambda: interior_point.step(problem, state, model, polish, last, guided),
     )
     return keep_finite(state, new, iteration, None)
 

@@ -180,3 +180,4 @@ def _rows(chosen: Sequence[str]) -> Iterator[Row]:
 if __name__ == "__main__":
     for each in sys.argv[1:]:
         print(json.dumps(measure(each)), flush=True)
+        jax.clear_caches()  # a process may map only so many programs into its memory
