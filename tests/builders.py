@@ -136,6 +136,7 @@ def made_up(problem, chains=2):
             "iteration": np.arange(2),
             "cost": np.zeros((2, chains)),
             "max_defect": np.zeros((2, chains)),
+            "residual": np.full((2, chains), NAN),
             "began": np.zeros(1, int),
             "noise_ends": np.zeros(1, int),
         },

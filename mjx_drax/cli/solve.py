@@ -106,6 +106,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(32, 64),
         help="bits of numbers: 64 makes and solves the problem in float64; default 32",
     )
+    add(
+        "--log",
+        action="store_true",
+        help="also print cost, max|h| and residual by iteration; plot.png draws them",
+    )
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
@@ -176,6 +181,8 @@ def _run(options: argparse.Namespace) -> int:
 
         render_diffusion(solution, film, draw=draw, **look)
     written += export.write(solution, folder, wanted, tell)
+    if options.log:
+        tell(solution.log())
     for line in summary.lines(solution):
         tell(line)
     tell(f"written to {folder}/: {', '.join(written)}")

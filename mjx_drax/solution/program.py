@@ -30,6 +30,7 @@ from mjx_drax.search.engine import Progress, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.solution.log import history_of, table
 from mjx_drax.solution.replay import plan_violations
 from mjx_drax.solution.results import statuses, tolerance_of
 from mjx_drax.solution.violations import Violation
@@ -98,6 +99,7 @@ class Minimum:
         tolerance: below which a residual is that of an optimum.
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
         interrupted: whether the solve was ended before its time.
+        history: of all chains by iteration; see `Solution`.
     """
 
     program: Problem
@@ -110,6 +112,11 @@ class Minimum:
     tolerance: float
     died_at: np.ndarray
     interrupted: bool
+    history: dict[str, np.ndarray]
+
+    def log(self) -> str:
+        """The history as a table, a line for each report; see `Solution.log`."""
+        return table(self.history, self.tolerance)
 
     @cached_property
     def feasible(self) -> np.ndarray:
@@ -203,6 +210,7 @@ def minimize(
             tolerance=tolerance_of(settings),
             died_at=np.asarray(state.died_at),
             interrupted=search.stage.place < len(search.stage.todo),
+            history=history_of(found),
         )
 
 

@@ -26,6 +26,7 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.recording import Recording
 from mjx_drax.search.restarts import Restarts
+from mjx_drax.solution.log import table
 from mjx_drax.solution.optima import TOLERANCE, cluster
 from mjx_drax.solution.replay import (
     OPEN_LOOP,
@@ -101,8 +102,9 @@ class Results:
         plan: violations of bounds and constraints of every chain's plan.
         open_loop, feedback: the replays of every chain.
         tolerances: of violations of replays.
-        history: `iteration` (records,), and `cost`, `max_defect` (records, chains) of every place
-            in the batch, which in later attempts of `Restarts` hold tries for unfinished chains;
+        history: `iteration` (records,), and `cost`, `max_defect`, `residual` (records, chains) of
+            every place in the batch, which in later attempts of `Restarts` hold tries for
+            unfinished chains; residuals are infinite before the polish, and NaN without one;
             `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
             its noise ended (the same, if it had none).
         iterations: how many were done.
@@ -140,6 +142,13 @@ class Results:
     def chains(self) -> int:
         """Number of chains."""
         return len(self.cost)
+
+    def log(self) -> str:
+        """The history as a table: cost, max|h| and residual of the best and the median chain.
+
+        A line for each report, with how many chains are feasible and optimal; see `log.table`.
+        """
+        return table(self.history, self.tolerance)
 
     @cached_property
     def plans(self) -> np.ndarray:

@@ -20,6 +20,7 @@ from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import Question, feedback_gains, partition
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.solution.log import history_of
 from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import tolerance_of
 from mjx_drax.solution.solution import Solution
@@ -113,7 +114,7 @@ def _certified(
     tolerances: Tolerances,
 ) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
-    state, info, records = found.chains.state, found.chains.info, found.records
+    state, info = found.chains.state, found.chains.info
     trajectories = jax.tree.map(np.asarray, state.trajectory)
     gains = np.asarray(state.gains)
     if not settings.flow.preconditioner.has_gains:
@@ -141,14 +142,8 @@ def _certified(
         open_loop=open_loop,
         feedback=feedback,
         tolerances=tolerances,
-        history={
-            "iteration": np.array([done for done, _ in records]),
-            "cost": np.stack([np.asarray(i.cost) for _, i in records]),
-            "max_defect": np.stack([np.asarray(i.max_defect) for _, i in records]),
-            "began": np.array([began for began, _ in found.began]),
-            "noise_ends": np.array([end for _, end in found.began]),
-        },
-        iterations=records[-1][0],
+        history=history_of(found),
+        iterations=found.records[-1][0],
         compile_time=found.compile_time,
         solve_time=found.solve_time,
         engine=problem.dynamics.engine,

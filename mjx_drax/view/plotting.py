@@ -26,6 +26,7 @@ from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.physics.states import finite
 from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.solution.log import residuals
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.labels import control_labels, state_groups
@@ -57,7 +58,8 @@ def plot_solution(
     """Draws a solution as a PNG, and returns its path.
 
     Panels: the best chain's states and controls, planned (dashed) and as replayed (solid); max|h|
-    of all chains and the cost of the feasible ones over the iterations; every chain's final cost.
+    of all chains, the cost of the feasible ones and, if there was a polish, the residual over the
+    iterations; every chain's final cost.
 
     Args:
         solution: from `solve`.
@@ -72,9 +74,10 @@ def plot_solution(
     if draw is not None:
         panels.append(partial(_draw_scene, solution=solution, draw=draw))
     panels += [partial(curves.draw, times=times, mode=mode) for curves in _motion(solution)]
+    of_polish = [_draw_residuals] * bool(np.isfinite(residuals(solution.history)).any())
     panels += [
         partial(draw_chains, solution=solution)
-        for draw_chains in (_draw_defects, _draw_costs, _draw_final_costs)
+        for draw_chains in (_draw_defects, _draw_costs, *of_polish, _draw_final_costs)
     ]
     color = BLACK if solution.certified else VERMILLION
     figure = panel_figure(panels, 2, (4.0, 2.6), fill=True)
@@ -349,6 +352,16 @@ def _draw_costs(axes: Axes, solution: Solution) -> None:
     _scale_costs(axes, solution.history["cost"][feasible])
     nothing = "" if feasible.any() else ": there are none"
     label_panel(axes, f"cost of feasible chains{nothing}", "iteration", handles)
+
+
+def _draw_residuals(axes: Axes, solution: Solution) -> None:
+    values = residuals(solution.history)
+    known = np.maximum(values, np.finfo(values.dtype).tiny)  # for the logarithm
+    handles = _draw_history(axes, solution, known, np.isfinite(values), PURPLE)
+    label = f"optimal: below {solution.tolerance:g}"
+    handles.append(axes.axhline(solution.tolerance, ls=":", lw=1.2, color=BLACK, label=label))
+    axes.set_yscale("log")
+    label_panel(axes, "residual of polished chains", "iteration", handles)
 
 
 def _draw_final_costs(axes: Axes, solution: Solution) -> None:

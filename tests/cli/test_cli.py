@@ -187,6 +187,17 @@ def test_settings_are_set_by_name(tmp_path, capsys):
     assert "at least 1" in error_of(capsys, *short.split(), "--set", "attempts=0")
 
 
+def test_the_log_is_printed(slider, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: slider)
+    words = f"solve pendulum --no-video --log --out {tmp_path}".split()
+    assert main(words) == 0
+    assert slider.log() in capsys.readouterr().out
+    assert main([*words, "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main([*words, "--json"]) == 0
+    json.loads(capsys.readouterr().out)
+
+
 def test_json_is_all_that_is_printed(slider, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: slider)
     assert main(f"solve pendulum --no-video --json --out {tmp_path}".split()) == 0

@@ -132,6 +132,11 @@ def test_solution_keeps_status_and_history(pendulum):
     np.testing.assert_array_equal(history["iteration"], np.arange(0, total + 1, REPORT_EVERY))
     np.testing.assert_array_equal(history["cost"][-1], pendulum.cost)
     np.testing.assert_array_equal(history["max_defect"][-1], pendulum.max_defect)
+    np.testing.assert_array_equal(history["residual"][-1], pendulum.residual)
+    assert not np.isfinite(history["residual"][: solver.descent // REPORT_EVERY]).any()
+    log = pendulum.log().splitlines()
+    assert len(log) == 2 + len(history["iteration"])
+    assert log[-1].split()[-2:] == [str(CHAINS), str(optimal.sum())]
     for c in np.flatnonzero(pendulum.feasible):
         since = history["iteration"] >= pendulum.feasible_since[c]
         assert (history["max_defect"][since, c] < 1e-3).all()

@@ -46,6 +46,20 @@ def test_function_problem(pendulum: Solution, tmp_path: Path) -> None:
     assert _size(path) == (1200, 1290)  # five panels in three rows
 
 
+def test_residuals_have_a_panel_where_there_was_a_polish(
+    pendulum: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles = []
+    monkeypatch.setattr(plotting, "label_panel", lambda axes, title, *_, **__: titles.append(title))
+    plot_solution(pendulum, tmp_path / "polished.png")
+    assert any(title.startswith("residual") for title in titles)
+    titles.clear()
+    unknown = {**pendulum.history, "residual": np.full_like(pendulum.history["cost"], np.nan)}
+    plot_solution(replace(pendulum, history=unknown), tmp_path / "not.png")
+    assert titles
+    assert not any(title.startswith("residual") for title in titles)
+
+
 def test_draw_adds_a_panel_of_the_replayed_motion(pendulum: Solution, tmp_path: Path) -> None:
     seen = []
 
