@@ -124,6 +124,7 @@ def made_up(problem, chains=2):
         max_defect=zero,
         max_violation=zero,
         residual=zero + NAN,
+        stalled=zero > 0,
         tolerance=1e-4,
         feasible_since=whole,
         died_at=whole - 1,

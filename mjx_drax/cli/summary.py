@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
-from mjx_drax.solution.results import Optimum
+from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import GOAL, TRACKING, words
 
@@ -13,8 +13,10 @@ OPTIMA = 5
 
 def lines(solution: Solution) -> list[str]:
     """Chains, the best one, the three parts of its certificate, distinct optima, times, verdict."""
-    best, status = solution.best_chain, solution.status
-    counts = ", ".join(f"{status.count(name)} {name}" for name in sorted(set(status)))
+    best = solution.best_chain
+    counts = _counts(solution.status)
+    if set(solution.polished) & {STALLED, UNFINISHED}:
+        counts += f" (polish: {_counts(solution.polished)})"
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     return [
@@ -30,6 +32,11 @@ def lines(solution: Solution) -> list[str]:
         f"time           {times}",
         solution.verdict if solution.certified else f"{solution.verdict}: {_advice(solution)}",
     ]
+
+
+def _counts(names: list[str]) -> str:
+    """How many there are of each name."""
+    return ", ".join(f"{names.count(name)} {name}" for name in sorted(set(names)))
 
 
 def _replay(solution: Solution, mode: str) -> str:
@@ -81,9 +88,11 @@ def _advice(solution: Solution) -> str:
     """What to try when no chain could be certified."""
     where = solution.where(solution.best_chain)
     if where is not None:
+        unfinished = solution.polished[solution.best_chain] == UNFINISHED
+        more = " or --max-iterations" if unfinished else ""
         return (
-            f"no plan is feasible; the best {where.told(solution.problem)}. Try more --iterations, "
-            "or a longer --horizon."
+            f"no plan is feasible; the best {where.told(solution.problem)}. Try more --iterations"
+            f"{more}, or a longer --horizon."
         )
     return (
         "feasible chains miss the goal or break constraints when replayed. Try more --chains, a "

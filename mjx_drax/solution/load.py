@@ -146,6 +146,7 @@ def _solution(
         max_defect=arrays["chain_max_defect"],
         max_violation=arrays["chain_max_violation"],
         residual=arrays["chain_residual"],
+        stalled=arrays.get("chain_stalled", np.zeros(len(arrays["chain_residual"]), bool)),
         tolerance=summary["tolerance"],
         feasible_since=arrays["chain_feasible_since"],
         died_at=arrays["chain_died_at"],
@@ -178,7 +179,7 @@ def _require_consistent(solution: Results, summary: dict[str, Any]) -> None:
         "multipliers": (solution.multipliers.dynamics, (chains, K, dynamics.ndx)),
     }
     numbers = ("cost", "max_defect", "max_violation", "residual", "feasible_since", "died_at")
-    for name in numbers:
+    for name in (*numbers, "stalled"):
         shapes[name] = getattr(solution, name), (chains,)
     for mode, violations in (
         ("plan", solution.plan),

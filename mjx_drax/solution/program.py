@@ -32,7 +32,7 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of, table
 from mjx_drax.solution.replay import plan_violations
-from mjx_drax.solution.results import statuses, tolerance_of
+from mjx_drax.solution.results import endings, stalled_of, statuses, tolerance_of
 from mjx_drax.solution.violations import Violation
 
 
@@ -96,6 +96,7 @@ class Minimum:
         cost: c(x), (chains,).
         max_defect: largest |h| or positive g, (chains,).
         residual: of the optimality conditions, scaled; NaN if not known, (chains,).
+        stalled: whether the polish of a chain found no step any more, (chains,).
         tolerance: below which a residual is that of an optimum.
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
         interrupted: whether the solve was ended before its time.
@@ -109,6 +110,7 @@ class Minimum:
     cost: np.ndarray
     max_defect: np.ndarray
     residual: np.ndarray
+    stalled: np.ndarray
     tolerance: float
     died_at: np.ndarray
     interrupted: bool
@@ -137,6 +139,11 @@ class Minimum:
     def status(self) -> list[str]:
         """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, for every chain."""
         return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
+
+    @cached_property
+    def polished(self) -> list[str]:
+        """How the polish of every chain ended; see `Solution.polished`."""
+        return endings(self.residual, self.tolerance, self.stalled)
 
     def where(self, chain: int) -> Violation | None:
         """The constraint that an infeasible chain breaks most; None for a feasible one."""
@@ -207,6 +214,7 @@ def minimize(
             cost=np.asarray(info.cost),
             max_defect=np.asarray(info.max_defect),
             residual=np.asarray(info.residual),
+            stalled=stalled_of(state),
             tolerance=tolerance_of(settings),
             died_at=np.asarray(state.died_at),
             interrupted=search.stage.place < len(search.stage.todo),

@@ -20,7 +20,9 @@ import jax
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, require_positive
+from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Multipliers
+from mjx_drax.polish.interior_point import Progress as PolishProgress
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE
@@ -46,6 +48,8 @@ from mjx_drax.solution.violations import (
 
 OPTIMAL, FEASIBLE_ONLY, INFEASIBLE = "optimal", "feasible", "infeasible"
 DIVERGED, INTERRUPTED = "diverged", "interrupted"
+
+CONVERGED, STALLED, UNFINISHED, UNPOLISHED = "converged", "stalled", "unfinished", "none"
 
 RESIDUAL = 1e-4
 """Residual below which a chain counts as optimal that was not polished."""
@@ -95,6 +99,7 @@ class Results:
         residual: of the optimality conditions of every chain's plan, scaled: the largest of the
             Lagrangian's slope, defects, constraints and complementarity; NaN if not known,
             (chains,).
+        stalled: whether the polish of a chain found no step any more, (chains,).
         tolerance: below which a residual is that of an optimum.
         feasible_since: iteration since which max|h| < 1e-3, else -1, (chains,).
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
@@ -123,6 +128,7 @@ class Results:
     max_defect: np.ndarray
     max_violation: np.ndarray
     residual: np.ndarray
+    stalled: np.ndarray
     tolerance: float
     feasible_since: np.ndarray
     died_at: np.ndarray
@@ -189,6 +195,16 @@ class Results:
         it succeeds. Interrupted is what was infeasible when the solve was ended before its time.
         """
         return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
+
+    @cached_property
+    def polished(self) -> list[str]:
+        """How the polish of every chain ended: `converged`, `stalled`, `unfinished` or `none`.
+
+        Converged: the residual is below the tolerance. Stalled: no step was found, as at a kink.
+        Unfinished: out of iterations, interrupted, or left aside when the others were done. None:
+        there was no polish.
+        """
+        return endings(self.residual, self.tolerance, self.stalled)
 
     @cached_property
     def open_loop_is_better(self) -> np.ndarray:
@@ -280,7 +296,8 @@ class Results:
     @property
     def optimality(self) -> str:
         """What is known of the best chain's optimality, in words."""
-        return optimality(float(self.residual[self.best_chain]), self.tolerance)
+        best = self.best_chain
+        return optimality(float(self.residual[best]), self.tolerance, self.polished[best])
 
     @property
     def verdict(self) -> str:
@@ -313,11 +330,29 @@ def tolerance_of(settings: Restarts) -> float:
     return float(np.asarray(polish.tolerance)) if polish and polish.iterations else RESIDUAL
 
 
-def optimality(residual: float, tolerance: float) -> str:
+def endings(residual: np.ndarray, tolerance: float, stalled: np.ndarray) -> list[str]:
+    """How the polish of every chain ended, from what is known of it, (chains,) each."""
+    names = np.where(stalled, STALLED, UNFINISHED)
+    names = np.where(residual < tolerance, CONVERGED, names)
+    found: list[str] = np.where(np.isnan(residual), UNPOLISHED, names).tolist()
+    return found
+
+
+def stalled_of(state: State) -> np.ndarray:
+    """Whether the polish of every chain found no step any more, (chains,)."""
+    progress = state.polish
+    known = isinstance(progress, PolishProgress)
+    return np.asarray(progress.stalled if known else np.zeros(len(state.trajectory.u), bool))
+
+
+def optimality(residual: float, tolerance: float, ending: str) -> str:
     """What a residual says, in words."""
-    if np.isnan(residual):
+    if not np.isfinite(residual):
         return "residual not known"
-    return f"residual {residual:.1e}, {'below' if residual < tolerance else 'above'} {tolerance:g}"
+    if residual < tolerance:
+        return f"residual {residual:.1e}, below {tolerance:g}"
+    how = {STALLED: ": the polish stalled", UNFINISHED: ": the polish is unfinished"}
+    return f"residual {residual:.1e}, above {tolerance:g}{how.get(ending, '')}"
 
 
 def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, ...]:

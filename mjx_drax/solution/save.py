@@ -46,7 +46,8 @@ OPTIMA = 32
 def summary(solution: Results) -> dict[str, Any]:
     """What `result.json` holds: settings, the best chain's numbers, certificate, versions."""
     best, certificate = solution.best_chain, solution.certificate
-    status, dynamics = solution.status, solution.problem.dynamics
+    status, polished = solution.status, solution.polished
+    dynamics = solution.problem.dynamics
     where = solution.where(best)
     whole: dict[str, Any] = {
         "format": FORMAT,
@@ -78,6 +79,7 @@ def summary(solution: Results) -> dict[str, Any]:
         "success_rate": solution.success_rate,
         "optimal_rate": float(solution.optimal_chains.mean()),
         "status": {name: status.count(name) for name in sorted(set(status))},
+        "polished": {name: polished.count(name) for name in sorted(set(polished))},
         "certificate": {
             "engine": certificate.engine,
             "open_loop": certificate.open_loop,
@@ -134,6 +136,7 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
         "chain_status": np.array(solution.status),
         "chain_replay_cost": solution.replay_cost,
         "chain_residual": solution.residual,
+        "chain_stalled": solution.stalled,
         "chain_feasible_since": solution.feasible_since,
         "chain_died_at": solution.died_at,
         **{f"history_{name}": values for name, values in solution.history.items()},

@@ -22,7 +22,7 @@ from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.replay import both_ways, plan_violations
-from mjx_drax.solution.results import tolerance_of
+from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import Tolerances, as_tolerances
 
@@ -134,6 +134,7 @@ def _certified(
         max_defect=np.asarray(info.max_defect),
         max_violation=np.asarray(info.max_violation),
         residual=np.asarray(info.residual),
+        stalled=stalled_of(state),
         tolerance=tolerance_of(settings),
         feasible_since=np.where(np.asarray(state.died_at) < 0, found.chains.feasible_since, -1),
         died_at=np.asarray(state.died_at),

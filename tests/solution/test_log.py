@@ -1,10 +1,15 @@
-"""The table of a history."""
+"""How chains got there, as a table, and how their polish ended."""
 
+from dataclasses import replace
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import INF, NAN
+from builders import INF, NAN, point
 
-from mjx_drax import from_program, minimize
+from mjx_drax import Restarts, Solution, from_program, minimize, solve
+from mjx_drax.cli import summary
+from mjx_drax.solution import save as results
 from mjx_drax.solution.log import residuals, table
 
 HISTORY = {
@@ -41,3 +46,21 @@ def test_programs_have_a_log_too():
     assert int(last[-1]) == found.optimal_chains.sum() == 4
     assert float(last[4]) == pytest.approx(found.residual[found.best_chain], rel=0.1)
     np.testing.assert_array_equal(found.history["residual"][-1], found.residual)
+
+
+def test_chains_that_stall_are_told_from_chains_that_run_out_of_iterations(tmp_path):
+    once = Restarts(descent=20, attempts=1)
+    kink = from_program(2, cost=lambda z: jnp.abs(z[0] - 0.3) + z[1] ** 2)
+    found = minimize(kink, chains=2, solver=once, precision=64)
+    assert found.polished == ["stalled"] * 2
+    assert found.status == ["feasible"] * 2
+    short = solve(point(), chains=2, solver=once, max_iterations=1)
+    assert short.polished == ["unfinished"] * 2
+    assert not short.stalled.any()
+    lines = summary.lines(short)
+    assert "polish: 2 unfinished" in lines[0]
+    assert any("the polish is unfinished" in line for line in lines)
+    stalled = replace(short, stalled=np.array([True, False]))
+    loaded = Solution.load(stalled.save(tmp_path))
+    assert loaded.polished == ["stalled", "unfinished"]
+    assert results.summary(loaded)["polished"] == {"stalled": 1, "unfinished": 1}

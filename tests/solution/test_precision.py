@@ -128,7 +128,7 @@ def test_a_model_reaches_1e_8(rail, tmp_path):
         np.testing.assert_array_equal(loaded.replayed[0], solution.replayed[0])
 
 
-def test_batches_and_programs_reach_1e_8(problem):
+def test_batches_reach_1e_8(problem):
     starts = np.array([[0.0, 0.0], [0.1, 0.0]])
     batch = solve_batch(
         lambda x: replace(problem, x_init=x), starts, chains=2, solver=ONCE, precision=64
@@ -137,6 +137,9 @@ def test_batches_and_programs_reach_1e_8(problem):
     assert batch.chain_residual.max() < 1e-8
     assert batch.where(0) is None
     assert_double(batch.x, batch.u, batch.cost)
+
+
+def test_programs_reach_1e_8():
     program = from_program(2, cost=lambda x: (x[0] - 1) ** 2 + 9 * (x[1] - x[0] ** 2) ** 2)
     found = minimize(program, chains=2, solver=ONCE, precision=64)
     assert found.residual.max() < 1e-8

@@ -296,9 +296,14 @@ def test_optimal_is_certified_with_a_small_residual():
     assert made.optimal
     assert made.verdict == "CERTIFIED and optimal"
     assert made.optimality == "residual 1.0e-06, below 0.0001"
+    assert made.polished == ["converged", "unfinished", "none", "converged"]
     others = replace(made, residual=np.full(4, 1e-2))
     assert not others.optimal
     assert others.verdict == "CERTIFIED, not known to be optimal"
+    assert others.optimality == "residual 1.0e-02, above 0.0001: the polish is unfinished"
+    others = replace(others, stalled=np.array([True, True, False, False]))
+    assert others.optimality == "residual 1.0e-02, above 0.0001: the polish stalled"
+    assert others.polished == ["stalled", "stalled", "unfinished", "unfinished"]
     ended = replace(made, interrupted=True, max_defect=np.array([0.0, 1.0, 0.0, 1.0]))
     ended = replace(ended, died_at=np.array([-1, -1, -1, 3]))
     assert ended.status == ["optimal", "interrupted", "feasible", "diverged"]
