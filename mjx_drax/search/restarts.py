@@ -228,7 +228,14 @@ def settled(
         raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
     settings = as_restarts(solver)
     settings.check(problem)
-    return _polished(settings, problem, tolerance, max_iterations).for_problem(problem)
+    settings = _polished(settings, problem, tolerance, max_iterations).for_problem(problem)
+    metric, polish = settings.flow.preconditioner, settings.polish
+    if polish is not None and polish.iterations and metric.derivatives is None:
+        raise DraxError(
+            f"the polish needs derivatives, and preconditioner is {type(metric).__name__}, which "
+            "asks for none: use GaussNewton(), or leave tolerance, max_iterations and polish out."
+        )
+    return settings
 
 
 def _polished(

@@ -12,6 +12,7 @@ from mjx_drax import (
     Constant,
     GaussNewton,
     Geometric,
+    Identity,
     Langevin,
     LogBarrier,
     Polish,
@@ -58,6 +59,11 @@ SETTINGS = [
     ("tolerance-batch",
      lambda at: solve_batch(lambda x: replace(at.point, x_init=x), np.zeros((2, 2)), tolerance=-1),
      "tolerance is -1"),
+    ("tolerance-metric",
+     lambda at: solve(
+         at.point, solver=Restarts(Langevin(preconditioner=Identity())), tolerance=1e-3
+     ),
+     "the polish needs derivatives", "Identity", "GaussNewton()"),
     ("precision-16", lambda at: solve(at.point, precision=16), "precision is 16", "give 64 or 32"),
     ("precision-text", lambda at: minimize(at.program, precision="64"), "precision is '64'"),
     ("precision-less", lambda at: solve(at.point.in_float64(), precision=32),
