@@ -8,7 +8,7 @@ from mjx_drax.search.engine import Found
 from mjx_drax.search.iterate import ranking
 
 HEADERS = (
-    f"{'':18}  {'best chain':^28}  {'median of chains':^28}",
+    f"{'':18}  {'best chain':^28}  {'median of chains':^28}".rstrip(),
     f"attempt  iteration  {'cost':>10}  max|h|  residual  {'cost':>10}  max|h|  residual"
     "  feasible  optimal",
 )
