@@ -60,7 +60,7 @@ COST_SCALE = 1 / 300
 STRICTER = 10.0
 """Factor on the scale of costs after an attempt in which not one chain became feasible."""
 
-NEGLIGIBLE = 0.03
+NEGLIGIBLE = 1e-3
 """Differences of cost below so many scales of costs do not count."""
 
 STRAGGLERS = 0.0005
@@ -268,8 +268,12 @@ class Search:
         stage, indices = self.stage, self.indices
         owners = np.tile(np.arange(self.chains), self.size)
         if stage.attempt > 0:
-            done = self._finished()[indices]
-            owners = np.concatenate([_owners(row) for row in done])
+            assert self.settings.enough is not None
+            left_alone = self._finished()[indices] & (self.settings.enough <= 1.0)
+            assert stage.kept is not None
+            shape = (self.family.count, self.chains)
+            cost = np.where(stage.kept.feasible, stage.kept.cost, np.inf).reshape(shape)[indices]
+            owners = np.concatenate([_owners(*row) for row in zip(left_alone, cost, strict=True)])
         knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, indices, stage.cost_scale)
         state = begin(self.question[1], self.question[0], knots, keys)
@@ -323,6 +327,7 @@ class Search:
         kept, shape = self.stage.kept, (self.family.count, self.chains)
         assert kept is not None
         cost, feasible = kept.cost.reshape(shape), kept.feasible.reshape(shape)
+        assert self.settings.within is not None
         return finished(cost, feasible, self.settings.within, self.stage.cost_scale)
 
     def _merged(self) -> Chains:
@@ -445,6 +450,7 @@ class Search:
         if not self.family.alone or stage.attempt + 1 == settings.attempts:
             return None
         assert settings.enough is not None
+        assert settings.within is not None
         costs, feasible = now.cost, now.feasible
         if kept is not None:  # the best may be among them
             costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.feasible)
@@ -666,9 +672,10 @@ def _unset(like: Chains, rows: int) -> Chains:
     return replace(empty, info=worst, feasible_since=np.full(rows, -1))
 
 
-def _owners(done: np.ndarray) -> np.ndarray:
-    """For which chain each place works: those that are not done, in turn, (chains,)."""
-    return np.resize(np.flatnonzero(~done) if not done.all() else [0], len(done))
+def _owners(done: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """For which chain each place works: those that are not done, the worst first, (chains,)."""
+    worst_first = np.argsort(-cost, kind="stable")
+    return np.resize(worst_first[~done[worst_first]] if not done.all() else [0], len(done))
 
 
 def _median(costs: np.ndarray) -> float:

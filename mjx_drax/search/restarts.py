@@ -39,8 +39,11 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.checks import check_flow
 
-ENOUGH, ENOUGH_KINKED = 0.95, 0.1
+ENOUGH, ENOUGH_KINKED = 0.97, 0.1
 """Default share of chains to be done; attempts are long where f has kinks."""
+
+WITHIN, WITHIN_KINKED = 0.1, 1.0
+"""Default excess over the best cost up to which a chain is done."""
 
 
 TOLERANCE = {4: 1e-4, 8: 1e-8}
@@ -80,9 +83,10 @@ class Restarts:
             first attempt is like the others, and the schedules are in the flow's own scale.
         attempts: largest number of attempts, the first included.
         within: a chain is done if it is feasible and its cost exceeds the best chain's by at most
-            this share.
-        enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.1
-            where f has kinks.
+            this share. None: 0.1, and 1 where f has kinks.
+        enough: share of chains to be done; then no further attempt is made. None: 0.97, and 0.1
+            where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
+            finds better optima where all chains of the first attempt lead to the same ones.
         heated: whether attempts after the first are heated, or descend like the first. None: unless
             f has kinks.
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
@@ -104,7 +108,7 @@ class Restarts:
     )
     descent: int | None = 100
     attempts: int = 5
-    within: float = 1.0
+    within: float | None = None
     enough: float | None = None
     heated: bool | None = None
     rollouts: Rollouts | None = None
@@ -138,6 +142,7 @@ class Restarts:
         """The same settings, with a value for each that is None."""
         kinked = problem.dynamics.kinked
         values: dict[str, Any] = {
+            "within": WITHIN_KINKED if kinked else WITHIN,
             "enough": ENOUGH_KINKED if kinked else ENOUGH,
             "heated": not kinked,
             "rollouts": Rollouts() if kinked else Rollouts(first=0, rounds=0),
@@ -172,7 +177,8 @@ class Restarts:
         if self.descent is not None:
             require_whole("descent", self.descent, 0)
         require_whole("attempts", self.attempts)
-        require_not_negative("within", self.within)
+        if self.within is not None:
+            require_not_negative("within", self.within)
         if self.enough is not None:
             require_not_negative("enough", self.enough)
         if not isinstance(self.heated, bool | None):

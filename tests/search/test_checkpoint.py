@@ -313,7 +313,7 @@ GUESS = Trajectory(jnp.ones((10, 2)), jnp.zeros((10, 1)))
     [
         ({"seed": 1}, "was written for seed 0, and this solve has seed 1: choose another file, or"),
         ({"chains": 8}, "chains 4, and this solve has chains 8"),
-        ({"solver": replace(SOLVER, within=0.5)}, "settings.within 1.0, and this solve has"),
+        ({"solver": replace(SOLVER, within=0.5)}, "settings.within 0.1, and this solve has"),
         ({"solver": Langevin()}, "settings.flow.iterations 20, and this solve has"),
         (
             {"problem": problem(x_init=[0.4, 0.0])},
