@@ -1,0 +1,70 @@
+"""What default settings answer: success, costs, residuals and time of tasks, seed by seed.
+
+    python -m mjx_drax.studies.answers [TASK[:CHAINS] ...] [--seeds N]
+
+A row for each task and seed: the share of chains whose replay succeeds; the best and the median
+cost of those; the share of all chains within 1 % of the best, and the share that is optimal, with
+a residual below the tolerance; iterations; and seconds to solve and to compile. Of each task the
+first row's solve time has work that is done once in a process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from mjx_drax import tasks
+from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solve import solve
+
+DEFAULT = (
+    "pendulum:16384",
+    "cartpole_swingup:1024",
+    "acrobot_swingup:256",
+    "double_pendulum_swingup:64",
+    "quadrotor_planar:64",
+    "bug_trap:1024",
+    "deep_trap:1024",
+)
+
+HEADER = (
+    "| problem | chains | seed | success | best cost | median | within 1 % | optimal | iterations "
+    "| solve [s] | compile [s] |\n" + "|---" * 11 + "|"
+)
+
+
+def line(solution: Solution) -> str:
+    """The row of a solve, in Markdown."""
+    good = np.asarray(solution.success)
+    costs = solution.cost[good]
+    best, median = solution.cost[solution.best_chain], np.median(costs) if good.any() else np.inf
+    close = (costs <= 1.01 * best).sum() / solution.chains
+    optimal = solution.residual < solution.tolerance
+    return (
+        f"| {solution.problem.name} | {solution.chains:,} | {solution.seed} | {good.mean():.2%} "
+        f"| {best:.6g} | {median:.5g} | {close:.0%} | {optimal.mean():.1%} "
+        f"| {solution.iterations} | {solution.solve_time:.3f} | {solution.compile_time:.0f} |"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Solve and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("tasks", nargs="*", default=DEFAULT)
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="solves of each task")
+    options = parser.parse_args(arguments)
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}\n\n{HEADER}", flush=True)
+    for word in options.tasks:
+        name, _, chains = word.partition(":")
+        problem = tasks.load(name).make()
+        for seed in range(options.seeds):
+            print(line(solve(problem, chains=int(chains or 64), seed=seed)), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
