@@ -208,6 +208,54 @@ def _soundness(
     return found
 
 
+def require_alive(flow: Langevin, problem: Problem, knots: Trajectory, died_at: np.ndarray) -> None:
+    """Complain about a function that is not finite, or has no finite derivative, where chains died.
+
+    Args:
+        flow, problem: as solved.
+        knots: the last finite ones of every chain, (chains, K, ...).
+        died_at: iteration at which each turned non-finite, (chains,).
+
+    Raises:
+        DraxError: naming the function, the knot and the fix, if there is one for every chain.
+    """
+    finite = _everywhere(problem, knots, _in_forward(flow, problem))
+    for label, *_ in functions_of(problem):
+        for what, good in zip(
+            ("value", "derivative", "second derivative"), finite[label], strict=False
+        ):
+            bad = ~np.asarray(good)
+            if bad.any(axis=1).all():
+                k = int(np.flatnonzero(bad[0])[0])
+                at = "the last state" if label.startswith("terminal") else f"knot {k}"
+                raise DraxError(
+                    f"the {what} of {label} is not finite at {at}, of all {len(bad)} chains after "
+                    f"at most {int(died_at.max()) + 1} iterations: change it (no 0/0, no log or "
+                    "sqrt of what may be 0 or negative; sqrt(y + 1e-6) has a derivative), or bound "
+                    "the states and controls to where it is finite."
+                )
+
+
+@partial(jax.jit, static_argnames="exact")
+def _everywhere(problem: Problem, knots: Trajectory, exact: bool) -> dict[str, list[Array]]:
+    """Whether functions and their derivatives are finite, (chains, K) or (chains, 1) at the end.
+
+    Derivatives are taken in one direction that moves every number.
+    """
+    stages = jnp.concatenate([problem.with_start(knots)[:, :-1], knots.u], axis=-1)
+    end = jnp.concatenate([knots.x[:, -1:], knots.u[:, -1:]], axis=-1)
+    found = {}
+    for label, function, arguments, _ in functions_of(problem):
+        at_end = len(arguments) == 1
+        order = (2 if label.endswith("cost") else 1) if exact else 0
+        one = _with_slopes(_of_knot(problem, function, at_end), order)
+        orders = jax.vmap(jax.vmap(one))(end if at_end else stages)
+        found[label] = [
+            jnp.isfinite(each).reshape(*each.shape[:2], -1).all(axis=-1) for each in orders
+        ]
+    return found
+
+
 def _of_knot(
     problem: Problem, function: Callable[..., Any], at_end: bool
 ) -> Callable[[Array], Array]:

@@ -31,7 +31,7 @@ from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint, facts
-from mjx_drax.search.checks import require_finite, require_sound
+from mjx_drax.search.checks import require_alive, require_finite, require_sound
 from mjx_drax.search.devices import gathered, spread
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
@@ -425,9 +425,19 @@ class Search:
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 now = Chains(state, info, np.where(feasible, since, -1))
                 self._report(replace(stage, now=now, step=stop), before + stop)
+                if not np.asarray(gathered(state.alive, self.mesh)).any():
+                    self._require_some(now)
+                    break
         except KeyboardInterrupt:  # the chains as they were at the last report
             return False
         return True
+
+    def _require_some(self, now: Chains) -> None:
+        """Complain where all chains of a first attempt died, and none of them is an answer."""
+        if self.family.alone and self.stage.attempt == 0 and not now.feasible.any():
+            knots = gathered(now.state.trajectory, self.mesh)
+            died_at = np.asarray(gathered(now.state.died_at, self.mesh))
+            require_alive(self.flow, self.family.at(0), replace(knots, slack=None), died_at)
 
     def _waits(self, now: Chains) -> bool:
         """Whether more than a share `STRAGGLERS` of the chains is still being polished.

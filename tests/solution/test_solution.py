@@ -366,6 +366,17 @@ def test_a_models_cost_that_is_nan_everywhere_is_refused(no_compilation):
             solve(problem, chains=3, solver=QUICK)
 
 
+@pytest.mark.parametrize("solver", [None, Langevin(iterations=1000)])
+def test_nan_away_from_x_init_ends_the_solve_and_names_the_knot(solver):
+    edge = reach(
+        running_cost=lambda x, u: 10.0 * (x[0] - 3.0) ** 2 - 0.1 * jnp.sqrt(0.5 - x[0]),
+        x_scatter=([-0.1, -0.1], [0.1, 0.1]),
+    )
+    words = r"the value of running_cost is not finite at knot \d+, of all 3 chains after at most"
+    with pytest.raises(DraxError, match=words):
+        solve(edge, chains=3, solver=solver)
+
+
 def test_a_chain_whose_cost_is_nan_is_diverged_and_never_best():
     guess = jax.tree.map(lambda a: a * np.array([-1, 1, 2])[:, None, None], knots(3))
     partly = reach(terminal_cost=lambda x: 1e-3 * jnp.sqrt(x[0]))
