@@ -61,7 +61,7 @@ ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
 DAMPED = 1e-2
 """First damping after a flow: with none, chains leap out of the basin that it has found."""
 
-STATES = 1e-2
+STATE_DAMPING = 1e-2
 """Damping of states beside that of controls: D is the largest along the motion, and often that of
 the end."""
 
@@ -178,9 +178,8 @@ def projected(problem: Problem, state: State) -> State:
     """
     knots = state.trajectory
     lower, upper = problem.bounds.sides(replace(knots, slack=None))
-    x, u = follow(
-        problem.dynamics, problem.with_start(knots), knots.u, state.gains, (lower.u, upper.u)
-    )
+    f, plan = problem.dynamics, problem.with_start(knots)
+    x, u = follow(f.step, f.difference, plan, knots.u, state.gains, (lower.u, upper.u))
     finite = jnp.isfinite(x).all()
     x, u = jnp.where(finite, x[1:], knots.x), jnp.where(finite, u, knots.u)
     return replace(state, trajectory=replace(knots, x=x, u=u))
@@ -432,7 +431,7 @@ def _direction(
         damped = QuadraticCost(
             gx,
             gu,
-            Hxx + STATES * damping * jnp.diag(of_x),
+            Hxx + STATE_DAMPING * damping * jnp.diag(of_x),
             whole.Hux,
             Huu + damping * jnp.diag(of_u),
         )
@@ -599,10 +598,6 @@ def _merit(
     costs = values.costs
     for slack in jax.tree.leaves(slacks_of(problem, knots)):
         logs = jnp.where(jnp.isinf(slack), 0.0, jnp.log(slack))
-        at_stages = logs.ndim > 1  # else at the end
-        costs = (
-            costs.at[:-1].add(-rho * jnp.sum(logs, axis=-1))
-            if at_stages
-            else costs.at[-1].add(-rho * jnp.sum(logs))
-        )
+        place = slice(None, -1) if logs.ndim > 1 else -1  # at stages, or at the end
+        costs = costs.at[place].add(-rho * jnp.sum(logs, axis=-1))
     return costs, penalties, Multipliers(values.defects, r)

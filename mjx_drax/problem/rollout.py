@@ -64,33 +64,27 @@ def _replay(
     limits: tuple[Array, Array],
 ) -> tuple[Array, Array]:
     lower, upper = (jnp.broadcast_to(side, u.shape[1:]) for side in limits)
-    functions = partial(step, dynamics), partial(difference, dynamics)
-    return jax.vmap(partial(_followed, functions, limits=(lower, upper)))(plan, u, gains)
+    one = partial(follow, partial(step, dynamics), partial(difference, dynamics))
+    return jax.vmap(partial(one, limits=(lower, upper)))(plan, u, gains)
 
 
 def follow(
-    dynamics: Any, plan: Array, u: Array, gains: Array, limits: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """The states x_0..x_K (K + 1, nx) and controls (K, nu) of one chain's plan under feedback.
-
-    Args:
-        dynamics: f and its arithmetic of states.
-        plan: planned states (K + 1, nx), of which the first is where it starts.
-        u: planned controls (K, nu).
-        gains: K_k in u_k + K_k (x_k - planned x_k), (K, nu, ndx).
-        limits: of controls, below and above, each (K, nu).
-    """
-    return _followed((dynamics.step, dynamics.difference), plan, u, gains, limits)
-
-
-def _followed(
-    functions: tuple[Callable[..., Array], Callable[..., Array]],
+    step: Callable[..., Array],
+    difference: Callable[..., Array],
     plan: Array,
     u: Array,
     gains: Array,
     limits: tuple[Array, Array],
 ) -> tuple[Array, Array]:
-    step, difference = functions
+    """The states x_0..x_K (K + 1, nx) and controls (K, nu) of one chain's plan under feedback.
+
+    Args:
+        step, difference: f(x, u), and x - y in the tangent space at y.
+        plan: planned states (K + 1, nx), of which the first is where it starts.
+        u: planned controls (K, nu).
+        gains: K_k in u_k + K_k (x_k - planned x_k), (K, nu, ndx).
+        limits: of controls, below and above, each (K, nu).
+    """
 
     def advance(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
         planned, control, gain, low, high = stage

@@ -5,7 +5,7 @@ Settings are looked at; functions are traced, and tried at the initial knots, wi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from typing import Any
@@ -169,43 +169,28 @@ def require_sound(flow: Langevin, problem: Problem, knots: Trajectory, with_f: b
         DraxError: naming the function, where it fails and the fix.
     """
     flow = replace(flow, scale=Scale())  # of one type, measured or not
-    finite = _soundness(flow, problem, knots, _in_forward(flow, problem), with_f)
-    for label, *_ in functions_of(problem):
-        for what, good in zip(
-            ("value", "derivative", "second derivative"), finite.get(label, []), strict=False
-        ):
-            if not np.asarray(good).any():
-                at = "the initial points"
-                if problem.dynamics.nx:
-                    at = "the last initial state" if label.startswith("terminal") else "x_init"
-                raise DraxError(
-                    f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
-                    "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
-                    "move x_init or the scatter of initial knots."
-                )
+    stages, end = _starts(flow, problem, knots)
+    finite = _finite(problem, stages, end, _in_forward(flow, problem), with_f)
+    for label, what, good in _by_function(problem, finite):
+        if not good.any():
+            at = "the initial points"
+            if problem.dynamics.nx:
+                at = "the last initial state" if label.startswith("terminal") else "x_init"
+            raise DraxError(
+                f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
+                "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
+                "move x_init or the scatter of initial knots."
+            )
 
 
-@partial(jax.jit, static_argnames=("exact", "with_f"))
-def _soundness(
-    flow: Langevin, problem: Problem, knots: Trajectory, exact: bool, with_f: bool
-) -> dict[str, list[Array]]:
-    """Whether functions, first and second derivatives are finite, (chains,) each.
-
-    Derivatives are taken in one direction that moves every number.
-    """
+@jax.jit
+def _starts(flow: Langevin, problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
+    """x_init and last states, each beside the first control, (chains, 1, nx + nu)."""
     inside = jax.vmap(partial(flow.bounds.interior, problem.bounds))(replace(knots, slack=None))
-    u = inside.u[:, 0]
-    start = jnp.broadcast_to(problem.x_init, (len(u), problem.dynamics.nx))
-    found = {}
-    for label, function, arguments, _ in functions_of(problem):
-        if function == problem.dynamics.step and not with_f:
-            continue
-        at_end = len(arguments) == 1
-        z = jnp.concatenate([inside.x[:, -1] if at_end else start, u], axis=1)
-        order = (2 if label.endswith("cost") else 1) if exact else 0
-        orders = jax.vmap(_with_slopes(_of_knot(problem, function, at_end), order))(z)
-        found[label] = [jnp.isfinite(each).reshape(len(u), -1).all(axis=1) for each in orders]
-    return found
+    u = inside.u[:, :1]
+    start = jnp.broadcast_to(problem.x_init, (*u.shape[:2], problem.dynamics.nx))
+    last = inside.x[:, -1:]
+    return jnp.concatenate([start, u], axis=-1), jnp.concatenate([last, u], axis=-1)
 
 
 def require_alive(flow: Langevin, problem: Problem, knots: Trajectory, died_at: np.ndarray) -> None:
@@ -219,33 +204,49 @@ def require_alive(flow: Langevin, problem: Problem, knots: Trajectory, died_at: 
     Raises:
         DraxError: naming the function, the knot and the fix, if there is one for every chain.
     """
-    finite = _everywhere(problem, knots, _in_forward(flow, problem))
-    for label, *_ in functions_of(problem):
-        for what, good in zip(
-            ("value", "derivative", "second derivative"), finite[label], strict=False
-        ):
-            bad = ~np.asarray(good)
-            if bad.any(axis=1).all():
-                k = int(np.flatnonzero(bad[0])[0])
-                at = "the last state" if label.startswith("terminal") else f"knot {k}"
-                raise DraxError(
-                    f"the {what} of {label} is not finite at {at}, of all {len(bad)} chains after "
-                    f"at most {int(died_at.max()) + 1} iterations: change it (no 0/0, no log or "
-                    "sqrt of what may be 0 or negative; sqrt(y + 1e-6) has a derivative), or bound "
-                    "the states and controls to where it is finite."
-                )
-
-
-@partial(jax.jit, static_argnames="exact")
-def _everywhere(problem: Problem, knots: Trajectory, exact: bool) -> dict[str, list[Array]]:
-    """Whether functions and their derivatives are finite, (chains, K) or (chains, 1) at the end.
-
-    Derivatives are taken in one direction that moves every number.
-    """
     stages = jnp.concatenate([problem.with_start(knots)[:, :-1], knots.u], axis=-1)
     end = jnp.concatenate([knots.x[:, -1:], knots.u[:, -1:]], axis=-1)
+    finite = _finite(problem, stages, end, _in_forward(flow, problem))
+    for label, what, good in _by_function(problem, finite):
+        if not good.all(axis=1).any():
+            k = int(np.argmin(good[0]))
+            at = "the last state" if label.startswith("terminal") else f"knot {k}"
+            raise DraxError(
+                f"the {what} of {label} is not finite at {at}, of all {len(good)} chains after "
+                f"at most {int(died_at.max()) + 1} iterations: change it (no 0/0, no log or "
+                "sqrt of what may be 0 or negative; sqrt(y + 1e-6) has a derivative), or bound "
+                "the states and controls to where it is finite."
+            )
+
+
+def _by_function(
+    problem: Problem, finite: dict[str, list[Array]]
+) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Label, what of it, and whether that is finite, of all that `_finite` has tried."""
+    names = "value", "derivative", "second derivative"
+    for label, *_ in functions_of(problem):
+        for what, good in zip(names, finite.get(label, []), strict=False):
+            yield label, what, np.asarray(good)
+
+
+@partial(jax.jit, static_argnames=("exact", "with_f"))
+def _finite(
+    problem: Problem, stages: Array, end: Array, exact: bool, with_f: bool = True
+) -> dict[str, list[Array]]:
+    """Whether functions, first and second derivatives are finite at z = [x, u], (chains, n) each.
+
+    Derivatives are taken in one direction that moves every number.
+
+    Args:
+        problem: whose functions.
+        stages, end: z of functions of a stage, and of the end, (chains, n, nx + nu).
+        exact: whether derivatives are tried.
+        with_f: whether f is tried.
+    """
     found = {}
     for label, function, arguments, _ in functions_of(problem):
+        if function == problem.dynamics.step and not with_f:
+            continue
         at_end = len(arguments) == 1
         order = (2 if label.endswith("cost") else 1) if exact else 0
         one = _with_slopes(_of_knot(problem, function, at_end), order)

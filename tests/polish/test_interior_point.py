@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import Langevin, Polish, Scale, Trajectory, from_function, from_program
+from mjx_drax.polish.interior_point import projected
 from mjx_drax.polish.residual import slacks_of
 from mjx_drax.search.iterate import Question, begin, iterate, partition
 from mjx_drax.studies.convergence import suite
@@ -151,3 +152,21 @@ def test_without_enough_iterations_a_chain_is_neither_optimal_nor_stalled():
     state, info = polished(problem, knots, Polish(1e-8, 5))
     assert state.polish.active
     assert info.residual > 1e-8
+
+
+def test_a_projected_chain_has_no_defects_and_keeps_its_controls_in_bounds():
+    problem = swing()
+    knots = straight(problem, None)
+    flow = Langevin(iterations=1)
+    key = jax.random.key(0)
+    off = replace(knots, x=knots.x + jax.random.normal(key, knots.x.shape))
+    state = flow.init(problem, knots, key)
+    gains = jnp.ones_like(state.gains)
+    state = replace(state, trajectory=replace(state.trajectory, x=off.x, u=off.u), gains=gains)
+    found = projected(problem, state).trajectory
+    assert jnp.abs(problem.defects(off)).max() > 0.1
+    assert jnp.abs(problem.defects(found)).max() < 1e-6
+    assert np.ptp(found.u) > 0.0  # feedback acted
+    assert found.u.max() == problem.bounds.u_upper[0]  # feedback alone would ask for more
+    lost = replace(state, gains=jnp.full_like(gains, jnp.nan))
+    np.testing.assert_array_equal(projected(problem, lost).trajectory.x, off.x)

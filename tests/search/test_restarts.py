@@ -26,7 +26,7 @@ from mjx_drax import (
 )
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
-from mjx_drax.search.engine import Chains, Search, best_of
+from mjx_drax.search.engine import Chains, Search, _owners, best_of
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import iterate
 from mjx_drax.search.restarts import Rollouts, settled
@@ -80,6 +80,11 @@ def test_beyond_enough_every_chain_is_tried_again():
     moved = further.chains.cost < 0.99 * first.chains.cost
     assert moved.any()
     assert len(further.began) == 3
+
+
+def test_the_worst_chains_get_most_places():
+    done, cost = np.array([False, True, False, False]), np.array([2.0, 1.0, np.inf, 5.0])
+    np.testing.assert_array_equal(_owners(done, cost), [2, 3, 0, 2])
 
 
 def test_chains_that_are_done_are_left_alone():
