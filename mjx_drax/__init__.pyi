@@ -22,6 +22,8 @@ from .method.schedules import Constant as Constant
 from .method.schedules import Geometric as Geometric
 from .method.schedules import Scale as Scale
 from .modelling import guesses as guesses
+from .modelling.moments import at_time as at_time
+from .modelling.moments import between as between
 from .modelling.terms import Terms as Terms
 from .physics.mjcf import from_mjcf as from_mjcf
 from .polish.interior_point import Polish as Polish
@@ -31,6 +33,7 @@ from .problem.differentiators import Autodiff as Autodiff
 from .problem.differentiators import Smoothed as Smoothed
 from .problem.dynamics import Dynamics as Dynamics
 from .problem.problem import Problem as Problem
+from .problem.trajectory import Knot as Knot
 from .problem.trajectory import Trajectory as Trajectory
 from .search.restarts import Restarts as Restarts
 from .search.restarts import Rollouts as Rollouts

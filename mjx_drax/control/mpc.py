@@ -49,9 +49,10 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
-from mjx_drax.problem.cost import Cost
+from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.problem import Problem, checked
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.rollout import follow
+from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.search.engine import Chains, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import (
@@ -245,8 +246,8 @@ class MPC:
         Raises:
             DraxError: x does not fit the problem, or is not finite; nor is t.
         """
-        problem = self.problem.with_x_init(x)
         _require_time(t)
+        problem = self.problem.with_x_init(x).at_time(t)
         clock = time.perf_counter()
         found = Search(Family.of_one(problem), self.chains, self.seed, self.solver).run()
         self._flow = found.flow
@@ -336,7 +337,7 @@ class MPC:
         self._carried, device = _plan(
             self._flow,
             replace(self._heated, scale=scale),
-            self._traced,
+            self._at(t),
             carried,
             np.asarray(x, number),
             number(by),
@@ -347,6 +348,11 @@ class MPC:
         if plan.finite or self._plan is None:
             self._plan = plan
         return plan
+
+    def _at(self, t: float) -> Problem:
+        """The problem at time t [s], with its numbers on the device."""
+        moved = self.problem.at_time(t)
+        return replace(self._traced, t_init=moved.t_init, data=moved.data)
 
     def _state(self, x: ArrayLike) -> np.ndarray:
         """A state as it was measured, (nx,) numbers that need not be finite."""
@@ -378,24 +384,29 @@ def holding(problem: Problem, hold: float) -> Problem:
     running, terminal = problem.running, problem.terminal
     scalar, residual = running.scalar, running.residual
     if terminal.scalar is not None:
-        scalar = Partial(_held, scalar, terminal.scalar, weight)
+        scalar = as_partial(Partial(_held, scalar, terminal.scalar, weight))
     if terminal.residual is not None:
-        residual = Partial(_held_residual, residual, terminal.residual, np.sqrt(weight))
+        root = np.sqrt(weight)
+        residual = as_partial(Partial(_held_residual, residual, terminal.residual, root))
     return replace(problem, running=Cost(scalar, residual))
 
 
-def _held(running: Partial | None, terminal: Partial, weight: Array, seen: Any, u: Array) -> Array:
+def _held(
+    running: Partial | None, terminal: Partial, weight: Array, seen: Any, u: Array, knot: Knot
+) -> Array:
     """l + weight phi, scalar."""
-    held = weight * terminal(seen)
-    return held if running is None else running(seen, u) + held
+    held = weight * at_knot(terminal, knot)(seen)
+    return held if running is None else at_knot(running, knot)(seen, u) + held
 
 
 def _held_residual(
-    running: Partial | None, terminal: Partial, root: Array, seen: Any, u: Array
+    running: Partial | None, terminal: Partial, root: Array, seen: Any, u: Array, knot: Knot
 ) -> Array:
     """[r, root r_end], (n,)."""
-    held = root * jnp.ravel(terminal(seen))
-    return held if running is None else jnp.concatenate([jnp.ravel(running(seen, u)), held])
+    held = root * jnp.ravel(at_knot(terminal, knot)(seen))
+    if running is None:
+        return held
+    return jnp.concatenate([jnp.ravel(at_knot(running, knot)(seen, u)), held])
 
 
 def _first(found: Chains, explorers: int, seed: int) -> Carried:
@@ -494,14 +505,13 @@ def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) 
     dynamics, best, box = problem.dynamics, carried.best, problem.bounds
     knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
 
-    def follow(x: Array, stage: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
-        planned, u, gain = stage
-        wanted = u + gain @ dynamics.difference(x, planned)
-        u = jnp.clip(wanted, box.u_lower, box.u_upper)
-        x = dynamics.step(x, u)
-        return x, (x, u)
+    def advance(x: Array, u: Array, knot: Knot) -> Array:
+        return dynamics.at(knot).step(x, u)
 
-    _, (x, u) = jax.lax.scan(follow, problem.x_init, (problem.stages(knots), knots.u, gains))
+    lower, upper = (jnp.broadcast_to(end, knots.u.shape) for end in (box.u_lower, box.u_upper))
+    plan, stages = problem.with_start(knots), problem.knots.at(slice(-1))
+    x, u = follow(advance, dynamics.difference, plan, knots.u, gains, (lower, upper), stages)
+    x = x[1:]
     rolled = Trajectory(jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0))
     everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
     inside = jax.vmap(partial(flow.inside, problem))(everyone)

@@ -29,8 +29,10 @@ def shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
         one, two = a[jnp.minimum(low, K - 1)], a[jnp.minimum(low + 1, K - 1)]
         return one + share.reshape(-1, *[1] * (a.ndim - 1)) * (two - one)
 
+    last = problem.end.dynamics
+
     def ahead(x: Array, _: None) -> tuple[Array, Array]:
-        x = dynamics.step(x, knots.u[-1])
+        x = last.step(x, knots.u[-1])
         return x, x
 
     _, beyond = jax.lax.scan(ahead, knots.x[-1], length=AHEAD)

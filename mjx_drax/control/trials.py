@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -198,7 +198,10 @@ def _cost(policy: MPC, motion: Motion) -> float:
 
 
 def _total(problem: Problem, x: jax.Array, u: jax.Array, end: jax.Array) -> jax.Array:
-    return jnp.sum(jax.vmap(problem.running_cost)(x, u)) + problem.terminal_cost(end)
+    row = jnp.minimum(jnp.arange(len(u)), problem.horizon)  # the last one stays
+    data = jax.tree.map(lambda a: a[row], problem.data)
+    knots = replace(problem, horizon=len(u) - 1, data=data).knots
+    return jnp.sum(jax.vmap(problem.running_cost)(x, u, knots)) + problem.terminal_cost(end)
 
 
 def lines(numbers: dict[str, Any]) -> list[str]:

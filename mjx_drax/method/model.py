@@ -24,7 +24,7 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.schedules import Weights
 from mjx_drax.problem.differentiators import Differentiator
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Stagewise, Trajectory, Values
+from mjx_drax.problem.trajectory import Knot, Stagewise, Trajectory, Values
 
 
 @register_dataclass
@@ -89,7 +89,6 @@ class Model:
         multipliers: lambda, and those of bounds.
         weights: sigma, mu, delta, rho.
         barrier: gradient and diagonal curvature of rho b, shaped like the knots.
-
         derivatives: at every knot; None where the metric asked for none.
     """
 
@@ -136,8 +135,8 @@ def expand(
     cost, stage, terminal, values = _expand_costs(problem, trajectory, by, keys)
     h = Multipliers(dynamics.h, problem.with_slack(values, trajectory.slack))
     derivatives = Derivatives(dynamics, cost, stage, terminal)
-    slope = _gradient(trajectory, multipliers, weights, derivatives, h)
-    slope = jax.tree.map(jnp.add, slope, barrier[0])
+    force = jax.tree.map(lambda m, r: m + weights.penalty * r, replace(multipliers, bounds=None), h)
+    slope = jax.tree.map(jnp.add, slope_of(derivatives, force, trajectory), barrier[0])
     return Model(trajectory, slope, h, multipliers, weights, barrier, derivatives)
 
 
@@ -148,15 +147,17 @@ def linearize(
     dynamics = problem.dynamics
     ndx, by = dynamics.ndx, dynamics.step_differentiator(by)
 
-    def stage(x: Array, u: Array, x_next: Array, key: Array) -> Linearization:
+    def stage(x: Array, u: Array, knot: Knot, x_next: Array, key: Array) -> Linearization:
+        f = dynamics.at(knot).step
+
         def defect(dz: Array) -> Array:
             moved = dynamics.integrate(x, dz[:ndx])
-            return dynamics.difference(dynamics.step(moved, u + dz[ndx:]), x_next)
+            return dynamics.difference(f(moved, u + dz[ndx:]), x_next)
 
         jacobian, h = by.jacobian(defect, ndx + dynamics.nu, key)
         return Linearization(jacobian[:, :ndx], jacobian[:, ndx:], h)
 
-    return jax.vmap(stage)(problem.stages(trajectory), trajectory.u, trajectory.x, keys)
+    return jax.vmap(stage)(*problem.stages(trajectory), trajectory.x, keys)
 
 
 def _expand_costs(
@@ -166,21 +167,25 @@ def _expand_costs(
     dynamics = problem.dynamics
     ndx, nu, by = dynamics.ndx, dynamics.nu, dynamics.differentiator(by)
 
-    def stage(x: Array, u: Array, key: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        def at(dz: Array) -> tuple[Any, Array]:
-            moved = u + dz[ndx:]
-            return dynamics.observe(dynamics.integrate(x, dz[:ndx]), moved), moved
+    def stage(
+        x: Array, u: Array, knot: Knot, key: Array
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        here = problem.at(knot)
 
-        return problem.running.expand(at, ndx + nu, by, key), by.jacobian(
-            lambda dz: problem.constraint(*at(dz)), ndx + nu, key
+        def moved(dz: Array) -> tuple[Any, ...]:
+            return here.seen(dynamics.integrate(x, dz[:ndx]), u + dz[ndx:])
+
+        return here.running.expand(moved, ndx + nu, by, key), by.jacobian(
+            lambda dz: here.constraint(*moved(dz)), ndx + nu, key
         )
 
-    def end(dx: Array) -> tuple[Any]:
-        return (dynamics.observe(dynamics.integrate(trajectory.x[-1], dx), jnp.zeros(nu)),)
+    def end(dx: Array) -> tuple[Any, ...]:
+        return problem.end.seen(dynamics.integrate(trajectory.x[-1], dx))
 
-    (g, H), (J, values) = jax.vmap(stage)(problem.stages(trajectory), trajectory.u, keys[:-1])
-    g_end, H_end = problem.terminal.expand(end, ndx, by, keys[-1])
-    J_end, values_end = by.jacobian(lambda dx: problem.terminal_constraint(*end(dx)), ndx, keys[-1])
+    (g, H), (J, values) = jax.vmap(stage)(*problem.stages(trajectory), keys[:-1])
+    last = problem.end
+    g_end, H_end = last.terminal.expand(end, ndx, by, keys[-1])
+    J_end, values_end = by.jacobian(lambda dx: last.terminal_constraint(*end(dx)), ndx, keys[-1])
     cost = QuadraticCost(
         jnp.concatenate([g[:, :ndx], g_end[None]]),
         g[:, ndx:],
@@ -191,27 +196,22 @@ def _expand_costs(
     return cost, J, J_end, Stagewise(values, values_end)
 
 
-def _gradient(
-    trajectory: Trajectory,
-    multipliers: Multipliers,
-    weights: Weights,
-    derivatives: Derivatives,
-    h: Multipliers,
+def slope_of(
+    derivatives: Derivatives, multipliers: Multipliers, knots: Trajectory, sign: float = -1.0
 ) -> Trajectory:
-    """grad c + J'(lambda + mu h), knot by knot."""
+    """grad c + J'lambda in tangent space; with sign = 1, of absolute values, the sum of terms."""
     dynamics, cost, stage, terminal = derivatives
-    ndx, present = dynamics.h.shape[-1], replace(multipliers, bounds=None)
-    force = jax.tree.map(lambda m, r: m + weights.penalty * r, present, h)
-    of_stage = jnp.einsum("kij,ki->kj", stage, force.constraints.stage)
+    ndx, rows = dynamics.h.shape[-1], multipliers.constraints
+    of_stage = jnp.einsum("kij,ki->kj", stage, rows.stage)
     gx = cost.gx.at[:-1].add(of_stage[:, :ndx])
-    gx = gx.at[-1].add(terminal.T @ force.constraints.terminal)
-    gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", dynamics.A, force.dynamics))
-    gu = cost.gu + of_stage[:, ndx:] + jnp.einsum("kij,ki->kj", dynamics.B, force.dynamics)
+    gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", dynamics.A, multipliers.dynamics))
+    gx = gx.at[-1].add(terminal.T @ rows.terminal)
+    gu = cost.gu + of_stage[:, ndx:]
+    gu = gu + jnp.einsum("kij,ki->kj", dynamics.B, multipliers.dynamics)
     slack = None
-    if trajectory.slack is not None:  # h = g + s: the rows of inequalities, the last ones
-        rows, sizes = force.constraints, trajectory.slack
-        slack = jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], sizes, rows)
-    return Trajectory(gx[1:] - force.dynamics, gu, slack)
+    if knots.slack is not None:  # the rows of inequalities, the last ones
+        slack = jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], knots.slack, rows)
+    return Trajectory(gx[1:] + sign * multipliers.dynamics, gu, slack)
 
 
 def augmented_lagrangian(

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, shown
@@ -29,9 +30,38 @@ from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.source import index, load
-from mjx_drax.problem.cost import as_partial
+from mjx_drax.problem.cost import as_partial, at_knot, depends_on_knot
+from mjx_drax.problem.tracing import plain
+from mjx_drax.problem.trajectory import Knot
 
 Names = str | Iterable[str]
+
+
+@register_dataclass
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A target for each knot: rows (K + 1, n), or a function of time [s] that returns (n,)."""
+
+    values: Any
+
+    def at(self, knot: Knot) -> Array:
+        """The target at one knot, (n,); the last row behind the end."""
+        if isinstance(self.values, Partial):
+            return jnp.asarray(self.values(knot.time))
+        row: Array = self.values[jnp.minimum(knot.index, len(self.values) - 1)]
+        return row
+
+    def check_knots(self, label: str, times: np.ndarray) -> None:
+        """Complain about another number of rows than there are knots."""
+        if not isinstance(self.values, Partial) and len(self.values) != len(times):
+            raise DraxError(
+                f"{label} follows a reference of {len(self.values)} rows: give {len(times)}, one "
+                "for each of x_0..x_K, or a function of time."
+            )
+
+
+def _at(number: Any, knot: Knot) -> Any:
+    return number.at(knot) if isinstance(number, Reference) else at_knot(number, knot)
 
 
 @register_dataclass
@@ -42,7 +72,7 @@ class Term:
     Attributes:
         function: the code, a function of a module.
         where: what it reads: addresses in `mjx.Data`.
-        numbers: targets and sizes, or the terms of a sum.
+        numbers: targets, `Reference`s and sizes, or the terms of a sum.
         scale: square roots of the weights, (n,) or ().
     """
 
@@ -51,9 +81,22 @@ class Term:
     numbers: tuple[Any, ...]
     scale: Array
 
-    def __call__(self, data: Any, u: Array | None = None) -> Array:
+    def __call__(self, data: Any, u: Array | None = None, knot: Knot | None = None) -> Array:
         """The residual (n,), at a knot with data and control u, or at the end without u."""
-        return self.scale * self.function(data, u, self.where, *self.numbers)
+        numbers = self.numbers if knot is None else [_at(number, knot) for number in self.numbers]
+        return self.scale * self.function(data, u, self.where, *numbers)
+
+    @property
+    def takes_knot(self) -> bool:
+        """Whether it follows a reference, or a term of a sum does."""
+        return any(isinstance(n, Reference) or depends_on_knot(n) for n in self.numbers)
+
+    def check_knots(self, label: str, times: np.ndarray) -> None:
+        """Complain about a reference that ends before the knots with `times` [s] do."""
+        for number in self.numbers:
+            for part in (number, *getattr(number, "args", ())):
+                if hasattr(part, "check_knots"):
+                    part.check_knots(label, times)
 
     def __add__(self, other: Callable[..., Array] | int) -> Term:
         """Both residuals in one vector, this one's first; `sum` of terms works as well."""
@@ -79,7 +122,8 @@ class Terms:
     """Makes the terms of one model.
 
     Every method takes `weight`, w >= 0: one number, or one for each element of the residual (0
-    leaves that element free).
+    leaves that element free). Targets of n numbers may be references as well: rows (K + 1, n), one
+    for each of the knots 0..K, or a function of time [s] that returns (n,).
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
@@ -116,10 +160,11 @@ class Terms:
                 at, size = model.jnt_qposadr[joint], _QPOS[model.jnt_type[joint]]
                 qpos[at : at + size] = _numbers(f"posture of {name!r}", value, size)
         else:
-            qpos = _numbers("posture", target, model.nq)
+            qpos = _target("posture", target, model.nq)
         joints = Joints.of(model)
-        for q, _ in joints.quaternions:
-            _unit("posture", qpos[q : q + 4])
+        for row in np.atleast_2d(_rows(qpos)):
+            for q, _ in joints.quaternions:
+                _unit("posture", row[q : q + 4])
         at = self._dofs(named)
         return _term(_posture, (joints, tuple(at)), (qpos,), "posture", len(at), weight)
 
@@ -128,7 +173,7 @@ class Terms:
     ) -> Term:
         """qvel [rad/s, m/s] of all joints or of the named ones, against a target of its size."""
         at = self._dofs(joints)
-        wanted = _numbers("target of velocity", target, len(at), alike=True)
+        wanted = _target("target of velocity", target, len(at), alike=True)
         return _term(_read, ("qvel", tuple(at)), (wanted,), "velocity", len(at), weight)
 
     def control(
@@ -138,14 +183,14 @@ class Terms:
         at = list(range(self.model.nu))
         if actuators is not None:
             at = self._indices("actuator", actuators)
-        wanted = _numbers("target of control", target, len(at), alike=True)
+        wanted = _target("target of control", target, len(at), alike=True)
         return _term(_control, tuple(at), (wanted,), "control", len(at), weight)
 
     def sensor(self, name: str, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0) -> Term:
         """What a sensor reads, in its units, against a target of its size."""
         sensor = index(self.model, "sensor", name)
         start, size = int(self.model.sensor_adr[sensor]), int(self.model.sensor_dim[sensor])
-        wanted = _numbers(f"target of sensor {name!r}", target, size, alike=True)
+        wanted = _target(f"target of sensor {name!r}", target, size, alike=True)
         where = ("sensordata", tuple(range(start, start + size)))
         return _term(_read, where, (wanted,), f"sensor {name!r}", size, weight)
 
@@ -197,7 +242,7 @@ class Terms:
     ) -> Term:
         """Centre of mass [m] (3,) of the model, or of a body and what it carries, to a target."""
         at = 0 if body is None else index(self.model, "body", body)
-        wanted = _numbers("position of centre_of_mass", position, 3)
+        wanted = _target("position of centre_of_mass", position, 3)
         return _term(_read, ("subtree_com", at), (wanted,), "centre_of_mass", 3, weight)
 
     def clearance(self, geoms: Names, others: Names, *, margin: ArrayLike = 0.0) -> Term:
@@ -247,7 +292,7 @@ class Terms:
             raise DraxError(f"{label} has no target: give a position, an orientation or both.")
         weights, parts = _weights(label, size, weight), []
         if position is not None:
-            wanted = _numbers(f"position of {label}", position, 3)
+            wanted = _target(f"position of {label}", position, 3)
             where = ("site_xpos" if kind == "site" else "xpos", at)
             parts.append(_term(_read, where, (wanted,), label, 3, weights[:3]))
         if orientation is not None:
@@ -337,6 +382,33 @@ def _numbers(label: str, value: Any, size: int, alike: bool = False) -> np.ndarr
     return np.broadcast_to(array, (size,))
 
 
+def _target(label: str, value: Any, size: int, alike: bool = False) -> Any:
+    """Finite numbers (size,), or a `Reference`: rows (K + 1, size), or a function of time [s]."""
+    if callable(value):
+        function = as_partial(value)
+        try:
+            shape = jax.eval_shape(function, jnp.zeros(())).shape
+        except Exception as error:
+            raise DraxError(
+                f"{label} failed when it was traced: {plain(error)}. Make it a JAX function of the "
+                f"time, one number, that returns {size} number(s)."
+            ) from error
+        if shape != (size,):
+            raise DraxError(f"{label} returned shape {shape}: return {size} number(s), ({size},).")
+        return Reference(function)
+    if np.ndim(value) != 2:
+        return _numbers(label, value, size, alike)
+    return Reference(jnp.asarray(np.stack([_numbers(label, row, size) for row in value])))
+
+
+def _rows(target: Any) -> np.ndarray:
+    """The numbers of a target that are known."""
+    if not isinstance(target, Reference):
+        return np.asarray(target)
+    known = not isinstance(target.values, Partial)
+    return np.asarray(target.values) if known else np.zeros((0, 0))
+
+
 def _unit(label: str, vector: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vector)
     if length < 1e-9:
@@ -370,13 +442,14 @@ def _weights(label: str, size: int, weight: ArrayLike) -> np.ndarray:
 def _term(
     function: Callable[..., Array],
     where: tuple[Any, ...],
-    numbers: Iterable[np.ndarray],
+    numbers: Iterable[Any],
     label: str,
     size: int,
     weight: ArrayLike,
 ) -> Term:
     scale = jnp.sqrt(jnp.asarray(_weights(label, size, weight)))
-    return Term(function, where, tuple(map(jnp.asarray, numbers)), scale)
+    made = (n if isinstance(n, Reference) else jnp.asarray(n) for n in numbers)
+    return Term(function, where, tuple(made), scale)
 
 
 def _no_distance(model: mujoco.MjModel, a: int, b: int) -> str:

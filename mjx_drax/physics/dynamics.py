@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -30,6 +31,7 @@ from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.physics.states import difference, integrate, quiet, set_state
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.trajectory import Knot
 
 STEP_LIMIT = 2_000
 """Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
@@ -123,6 +125,7 @@ class MjxDynamics(Dynamics):
         derivatives: how f is differentiated; None: exactly.
         origin: what `mj_model` was compiled from: a file, XML or a `Source`; None if unknown.
         structure: what compiled functions know of the model, found when this is constructed.
+        time: of the knot that `at` has bound this to [s]; None if it has not.
     """
 
     model: mjx.Model
@@ -132,6 +135,7 @@ class MjxDynamics(Dynamics):
     derivatives: Differentiator | None = None
     origin: str | Path | Source | None = field(default=None, metadata=HostOnly)
     structure: Structure = field(init=False)
+    time: Array | None = field(default=None, init=False)
     checked = True
     twice = False
 
@@ -199,9 +203,16 @@ class MjxDynamics(Dynamics):
         """f(x, u), (nx,)."""
         return _step(self.model, self.structure, self.substeps, x, u)
 
+    def at(self, knot: Knot) -> Self:
+        """The same at one knot: costs read its time."""
+        new = copy(self)  # not `replace`, which would look for the structure anew
+        object.__setattr__(new, "time", knot.time)
+        return new
+
     def observe(self, x: Array, u: Array) -> mjx.Data:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
-        return _observe(self.model, self.structure, x, u)
+        data = _observe(self.model, self.structure, x, u)
+        return data if self.time is None else data.replace(time=self.time)
 
     @property
     def kinked(self) -> bool:  # type: ignore[override]
@@ -253,6 +264,7 @@ class MjxDynamics(Dynamics):
         u: np.ndarray,
         gains: np.ndarray,
         limits: tuple[np.ndarray, np.ndarray],
+        knots: Knot,
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`.
 
@@ -262,7 +274,7 @@ class MjxDynamics(Dynamics):
         """
         model = self.mj_model
         lower, upper = (np.broadcast_to(side, u.shape[1:]) for side in limits)
-        chains, knots = u.shape[:2]
+        chains, stages = u.shape[:2]
         states, applied = np.full(plan.shape, np.nan), np.full(u.shape, np.nan)
         states[:, 0] = plan[:, 0]
         threads = min(-(-chains // CHAINS_PER_THREAD), os.cpu_count() or 1)
@@ -274,7 +286,7 @@ class MjxDynamics(Dynamics):
         now[:, x] = plan[:, 0]
         steps = np.empty((chains, self.substeps, len(start)))
         with quiet(), Rollout(nthread=threads if threads > 1 else 0) as engine:
-            for k in range(knots):
+            for k in range(stages):
                 off = self.host_difference(states[:, k], plan[:, k])
                 wanted = u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off)
                 applied[:, k] = np.clip(wanted, lower[k], upper[k])
@@ -314,12 +326,13 @@ class MjxDynamics(Dynamics):
     def observe_replayed(self, x: np.ndarray) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
         data = mujoco.MjData(self.mj_model)
+        data.time = 0.0 if self.time is None else float(self.time)
         set_state(self.mj_model, data, x)
         mujoco.mj_forward(self.mj_model, data)
         return data
 
 
-_TRACED, _STATIC = ("model", "dt", "derivatives"), ("substeps", "structure")
+_TRACED, _STATIC = ("model", "dt", "derivatives", "time"), ("substeps", "structure")
 
 
 def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

@@ -51,6 +51,7 @@ def from_mjcf(
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     contacts: bool | int = True,
     derivatives: Differentiator | None = None,
+    data: Any = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
     name: str | None = None,
@@ -58,8 +59,9 @@ def from_mjcf(
     """A problem whose dynamics are those of a MuJoCo model.
 
     Costs see `mjx.Data` after `mjx.forward` (qpos, qvel, site and body positions, sensors, ...);
-    what they do not read is not computed. Joint ranges and control ranges of the model become
-    bounds, which are intersected with `x_bounds` and `u_bounds`.
+    what they do not read is not computed; `data.time` is that of the knot [s]. A parameter `knot`
+    besides receives the `Knot`: its time, its number and its data. Joint ranges and control ranges
+    of the model become bounds, which are intersected with `x_bounds` and `u_bounds`.
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
@@ -90,6 +92,8 @@ def from_mjcf(
             keeps all contacts.
         derivatives: of f; by default exact, also in contact. `Smoothed()` fits them to samples,
             which feel a contact that is as far away as the samples are spread.
+        data: numbers for each knot: arrays (K + 1, ...) in any pytree, or a function of a knot's
+            time [s] that returns one. Functions with a parameter `knot` read them there.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
         guess: guess(key) -> Trajectory, instead of the scatter boxes.
         name: used in files and tables; by default the model's name.
@@ -133,7 +137,7 @@ def from_mjcf(
         near = 1.0
     start = jnp.asarray(x0)
     return assembled(
-        dynamics, given, start, bounds, scatter, K, near, goal=goal, guess=guess, name=name
+        dynamics, given, start, bounds, scatter, K, near, data, goal=goal, guess=guess, name=name
     )
 
 

@@ -15,7 +15,7 @@ from jax import Array
 from mjx_drax.method.model import Multipliers, QuadraticCost
 from mjx_drax.problem.differentiators import Differentiator
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.trajectory import Knot, Trajectory
 
 
 def with_exact_hessian(
@@ -30,21 +30,25 @@ def with_exact_hessian(
     ndx, nu = dynamics.ndx, dynamics.nu
     by = dynamics.step_differentiator(by)
 
-    def stage(x: Array, u: Array, x_next: Array, lambda_: Array, force: Array) -> Array:
+    def stage(x: Array, u: Array, knot: Knot, x_next: Array, lambda_: Array, force: Array) -> Array:
+        here = problem.at(knot)
+
         def lagrangian(dz: Array) -> Array:
-            x_moved, u_moved = dynamics.integrate(x, dz[:ndx]), u + dz[ndx:]
-            seen = dynamics.observe(x_moved, u_moved)
-            defect = dynamics.difference(dynamics.step(x_moved, u_moved), x_next)
-            constrained = jnp.dot(force, problem.constraint(seen, u_moved))
-            return problem.running(seen, u_moved) + jnp.dot(lambda_, defect) + constrained
+            moved = dynamics.integrate(x, dz[:ndx]), u + dz[ndx:]
+            seen = here.seen(*moved)
+            defect = dynamics.difference(here.dynamics.step(*moved), x_next)
+            constrained = jnp.dot(force, here.constraint(*seen))
+            return here.running(*seen) + jnp.dot(lambda_, defect) + constrained
 
         return by.hessian(lagrangian, ndx + nu)
 
-    def end(dx: Array) -> Array:
-        seen = dynamics.observe(dynamics.integrate(knots.x[-1], dx), jnp.zeros(nu))
-        return problem.terminal(seen) + jnp.dot(rows.terminal, problem.terminal_constraint(seen))
+    last = problem.end
 
-    H = jax.vmap(stage)(problem.stages(knots), knots.u, knots.x, multipliers.dynamics, rows.stage)
+    def end(dx: Array) -> Array:
+        seen = last.seen(dynamics.integrate(knots.x[-1], dx))
+        return last.terminal(*seen) + jnp.dot(rows.terminal, last.terminal_constraint(*seen))
+
+    H = jax.vmap(stage)(*problem.stages(knots), knots.x, multipliers.dynamics, rows.stage)
     H_end = by.hessian(end, ndx) if ndx else jnp.zeros((0, 0))
     return QuadraticCost(
         cost.gx,

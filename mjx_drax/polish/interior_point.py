@@ -53,7 +53,7 @@ from mjx_drax.polish.secant import Secant, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.rollout import follow
-from mjx_drax.problem.trajectory import Stagewise, Trajectory
+from mjx_drax.problem.trajectory import Knot, Stagewise, Trajectory
 
 ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
 """Share of what is promised that a step must bring; the first funnel, and the factor when used."""
@@ -178,8 +178,13 @@ def projected(problem: Problem, state: State) -> State:
     """
     knots = state.trajectory
     lower, upper = problem.bounds.sides(replace(knots, slack=None))
-    f, plan = problem.dynamics, problem.with_start(knots)
-    x, u = follow(f.step, f.difference, plan, knots.u, state.gains, (lower.u, upper.u))
+    f, plan, stages = problem.dynamics, problem.with_start(knots), problem.knots.at(slice(-1))
+
+    def advance(x: Array, u: Array, knot: Knot) -> Array:
+        return f.at(knot).step(x, u)
+
+    limits = lower.u, upper.u
+    x, u = follow(advance, f.difference, plan, knots.u, state.gains, limits, stages)
     finite = jnp.isfinite(x).all()
     x, u = jnp.where(finite, x[1:], knots.x), jnp.where(finite, u, knots.u)
     return replace(state, trajectory=replace(knots, x=x, u=u))
@@ -325,7 +330,7 @@ def _moved(
     after = jnp.where(found, lower, higher)
     shortfall, present = _worst(left, rows), _worst(model.h, rows)
     loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
-    most = 1e-2 / jnp.finfo(alpha.dtype).eps
+    most = 1e-2 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
     stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
     blocked = jnp.minimum(RAISE * rho, 0.1 * scales.terms)
     now = replace(

@@ -24,7 +24,7 @@ from jax import Array
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.bounds import Sides
-from mjx_drax.method.model import Derivatives, Model, Multipliers
+from mjx_drax.method.model import Derivatives, Model, slope_of
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 
@@ -146,24 +146,6 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         gap / cost,
         error,
     ), scales
-
-
-def slope_of(
-    derivatives: Derivatives, multipliers: Multipliers, knots: Trajectory, sign: float = -1.0
-) -> Trajectory:
-    """grad c + J'lambda in tangent space; with sign = 1, of absolute values, the sum of terms."""
-    dynamics, cost, stage, terminal = derivatives
-    ndx, rows = dynamics.h.shape[-1], multipliers.constraints
-    of_stage = jnp.einsum("kij,ki->kj", stage, rows.stage)
-    gx = cost.gx.at[:-1].add(of_stage[:, :ndx])
-    gx = gx.at[:-1].add(jnp.einsum("kij,ki->kj", dynamics.A, multipliers.dynamics))
-    gx = gx.at[-1].add(terminal.T @ rows.terminal)
-    gu = cost.gu + of_stage[:, ndx:]
-    gu = gu + jnp.einsum("kij,ki->kj", dynamics.B, multipliers.dynamics)
-    slack = None
-    if knots.slack is not None:  # the rows of inequalities, the last ones
-        slack = jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], knots.slack, rows)
-    return Trajectory(gx[1:] + sign * multipliers.dynamics, gu, slack)
 
 
 def row_scales(derivatives: Derivatives, scales: Scales, knots: Trajectory) -> tuple[Array, Array]:

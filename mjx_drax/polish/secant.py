@@ -69,7 +69,7 @@ class Secant:
         dynamics, cost, stage, _ = derivatives
         J = jnp.concatenate([jnp.concatenate([dynamics.A, dynamics.B], axis=2), stage], axis=1)
         g = jnp.concatenate([cost.gx[:-1], cost.gu], axis=1)
-        x = problem.stages(knots)
+        x = problem.with_start(knots)[:-1]
         s = jnp.concatenate(
             [jax.vmap(problem.dynamics.difference)(x, self.x), knots.u - self.u], axis=1
         )

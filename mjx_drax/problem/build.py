@@ -7,16 +7,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole, shown
 from mjx_drax.base.numbers import vector
 from mjx_drax.problem.cost import as_partial, constraint_of, cost_of
+from mjx_drax.problem.data import rows
 from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import require_functions
-from mjx_drax.problem.trajectory import Box, Trajectory, box
+from mjx_drax.problem.trajectory import Box, Knot, Trajectory, box
 
 MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
@@ -62,11 +64,15 @@ def from_function(
     u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    data: Any = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
     name: str = "problem",
 ) -> Problem:
     """A problem whose dynamics are a JAX function f(x (nx,), u (nu,)) -> x_next (nx,).
+
+    f, costs, residuals and constraints may have a parameter `knot` besides; it receives the `Knot`:
+    its time, its number and its data.
 
     Args:
         f: the dynamics. Parameters that should stay changeable without recompiling are bound with
@@ -88,6 +94,8 @@ def from_function(
         x_scatter: box from which initial states are drawn; by default the bounds, and within
             +-1 of x_init where those are infinite.
         u_scatter: the same for controls; within +-1 of 0 where the bounds are infinite.
+        data: numbers for each knot: arrays (K + 1, ...) in any pytree, or a function of a knot's
+            time [s] that returns one. Functions with a parameter `knot` read them there.
         goal: goal(x_K) -> bool, what a replay must reach.
         guess: guess(key) -> Trajectory, instead of the scatter boxes.
         name: used in files and tables.
@@ -125,7 +133,7 @@ def from_function(
     scatter = scatter_box(bounds, start, jnp.ones(nx), x_scatter, u_scatter)
     near = 1.0 if dynamics.kinked or dynamics.nx != dynamics.ndx else 0.0
     return assembled(
-        dynamics, given, start, bounds, scatter, K, near, goal=goal, guess=guess, name=name
+        dynamics, given, start, bounds, scatter, K, near, data, goal=goal, guess=guess, name=name
     )
 
 
@@ -164,6 +172,7 @@ def assembled(
     scatter: Box,
     horizon: int,
     near: float,
+    data: Any = None,
     **host: Any,
 ) -> Problem:
     """A problem from its parts, checked.
@@ -176,10 +185,19 @@ def assembled(
         scatter: box for initial knots.
         horizon: K.
         near: share of chains that start nearer to x_init.
+        data: for each knot, as a user gives it.
         host: goal, guess and name.
     """
-    x, u = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu)
-    seen = jax.eval_shape(dynamics.observe, x, u)
+    x, u, t_init = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu), jnp.zeros(())
+    times = float(dynamics.dt) * np.arange(horizon + 1)
+    found = rows(data, times)
+    first = jax.tree.map(lambda a: a[0], found)
+    here = Knot(t_init, jnp.zeros((), int), jnp.asarray(dynamics.dt, float), first)
+    for label, function in given.items():
+        check = getattr(function, "check_knots", None)
+        if check is not None:
+            check(label, times)
+    seen = jax.eval_shape(dynamics.at(here).observe, x, u)
     stage = given["equality"], given["inequality"]
     end = given["terminal_equality"], given["terminal_inequality"]
     return checked(
@@ -187,13 +205,16 @@ def assembled(
             dynamics=dynamics,
             running=cost_of(given["running_cost"], given["running_residual"]),
             terminal=cost_of(given["terminal_cost"], given["terminal_residual"]),
-            constraint=constraint_of(*stage, (seen, u)),
-            terminal_constraint=constraint_of(*end, (seen,), "terminal_"),
+            constraint=constraint_of(*stage, (seen, u), here),
+            terminal_constraint=constraint_of(*end, (seen,), here, "terminal_"),
             x_init=x_init,
             bounds=bounds,
             scatter=scatter,
             horizon=horizon,
             near=near,
+            data=found,
+            t_init=t_init,
+            data_at=data if callable(data) else None,
             **host,
         )
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
+from inspect import signature
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from mjx_drax.kernels.linalg import transposed_product
 from mjx_drax.problem.differentiators import Differentiator, positive_part
 from mjx_drax.problem.rollout import untraced
 from mjx_drax.problem.tracing import traced
+from mjx_drax.problem.trajectory import Knot
 
 
 def as_partial(function: Callable[..., Any]) -> Partial:
@@ -27,6 +29,12 @@ def as_partial(function: Callable[..., Any]) -> Partial:
     is how a cost or a model takes parameters that may change without recompiling. So does any other
     callable that is registered as a pytree, like the terms of `mjx_drax.Terms`.
     """
+    if takes_knot(function):
+        return Partial(_of_knot, _as_partial(function))
+    return _as_partial(function)
+
+
+def _as_partial(function: Callable[..., Any]) -> Partial:
     if isinstance(function, Partial):
         return function
     if not jax.tree_util.all_leaves([function]):
@@ -39,16 +47,49 @@ def as_partial(function: Callable[..., Any]) -> Partial:
 def _call_of(cls: type) -> Callable[..., Any]:
     """What calls objects of one class: of two classes the structures may be equal, this is not."""
 
-    def call(function: Callable[..., Any], *arguments: Any) -> Any:
-        return function(*arguments)
+    def call(function: Callable[..., Any], *arguments: Any, **knot: Knot) -> Any:
+        return function(*arguments, **knot)
 
     return call
 
 
-def in_float64(function: Partial | None) -> Partial | None:
+def takes_knot(function: Callable[..., Any]) -> bool:
+    """Whether a function asks for its `Knot`: it has a parameter `knot`, not bound yet.
+
+    A callable object may say so itself, by an attribute `takes_knot`.
+    """
+    own = getattr(function, "takes_knot", None)
+    if own is not None:
+        return bool(own)
+    try:
+        return "knot" in signature(function).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def _of_knot(function: Callable[..., Any], *arguments: Any, knot: Knot) -> Any:
+    """What `as_partial` makes of a function that takes its knot."""
+    return function(*arguments, knot=knot)
+
+
+def at_knot(function: Any, knot: Knot) -> Any:
+    """The function at one knot; the same one if it does not ask for it."""
+    if not depends_on_knot(function):
+        return function
+    return Partial(_of_knot, *function.args, knot=knot)
+
+
+def depends_on_knot(function: Any) -> bool:
+    """Whether `as_partial` has found that the function takes its knot."""
+    return isinstance(function, Partial) and function.func is _of_knot
+
+
+def in_float64(function: Any) -> Any:
     """The same function, none of whose constants JAX has seen in float32."""
     if function is None:
         return None
+    if function.func is _of_knot:
+        return Partial(_of_knot, *map(in_float64, function.args), **function.keywords)
     return Partial(untraced(function.func), *function.args, **function.keywords)
 
 
@@ -72,6 +113,10 @@ class Cost:
         if self.residual is not None:
             total = total + 0.5 * jnp.sum(jnp.square(self.residual(*arguments)))
         return total
+
+    def at(self, knot: Knot) -> Cost:
+        """The same cost at one knot."""
+        return Cost(at_knot(self.scalar, knot), at_knot(self.residual, knot))
 
     def in_float64(self) -> Cost:
         """The same cost for float64; see `Problem.in_float64`."""
@@ -119,6 +164,11 @@ class Constraint:
         parts = [p for p in (self.equality, self.inequality) if p is not None]
         return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
 
+    def at(self, knot: Knot) -> Constraint:
+        """The same constraint at one knot."""
+        parts = at_knot(self.equality, knot), at_knot(self.inequality, knot)
+        return Constraint(*parts, self.equalities, self.inequalities)
+
     def in_float64(self) -> Constraint:
         """The same constraint for float64; see `Problem.in_float64`."""
         parts = in_float64(self.equality), in_float64(self.inequality)
@@ -152,15 +202,14 @@ def constraint_of(
     equality: Callable[..., Any] | None,
     inequality: Callable[..., Any] | None,
     arguments: tuple[Any, ...],
+    knot: Knot,
     label: str = "",
 ) -> Constraint:
     """A Constraint from the functions that a user gives; their sizes are traced abstractly."""
-    sizes = []
-    for name, function in (("equality", equality), ("inequality", inequality)):
-        if function is None:
-            sizes.append(0)
-            continue
-        out = traced(f"{label}{name}", function, arguments)
-        sizes.append(int(np.prod(out.shape)))
     parts = [None if f is None else as_partial(f) for f in (equality, inequality)]
+    sizes = []
+    for name, part in zip(("equality", "inequality"), parts, strict=True):
+        here = at_knot(part, knot)
+        out = None if here is None else traced(f"{label}{name}", here, arguments)
+        sizes.append(0 if out is None else int(np.prod(out.shape)))
     return Constraint(parts[0], parts[1], sizes[0], sizes[1])

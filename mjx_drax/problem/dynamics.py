@@ -12,7 +12,7 @@ quaternions) brings three, `step`, `difference` and `integrate`, and `ndx`. The 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +21,8 @@ from jax.tree_util import Partial
 
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.problem import rollout
+from mjx_drax.problem.cost import at_knot, in_float64
+from mjx_drax.problem.trajectory import Knot
 
 
 class Dynamics:
@@ -54,6 +56,10 @@ class Dynamics:
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u): the state (nx,) one knot after x (nx,) under the control u (nu,)."""
         raise NotImplementedError
+
+    def at(self, knot: Knot) -> Self:
+        """The same system at one knot, where `step` and `observe` depend on its time or data."""
+        return self
 
     def difference(self, x: Array, y: Array) -> Array:
         """x - y in the tangent space at y, (ndx,), so that integrate(y, x - y) = x."""
@@ -109,6 +115,7 @@ class Dynamics:
         u: np.ndarray,
         gains: np.ndarray,
         limits: tuple[np.ndarray, np.ndarray],
+        knots: Knot,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Run u_k + K_k (x_k - plan_k), clipped to the control limits, in float64.
 
@@ -117,11 +124,12 @@ class Dynamics:
             u: planned controls, (chains, K, nu).
             gains: feedback K_k, (chains, K, nu, ndx); zeros replay open loop.
             limits: (lower, upper), each broadcastable to (K, nu).
+            knots: those of the K stages, for all chains, or for each with an axis in front.
 
         Returns:
             states (chains, K + 1, nx) and the controls that were applied (chains, K, nu).
         """
-        return rollout.replay(self, plan, u, gains, limits)
+        return rollout.replay(self, plan, u, gains, limits, knots)
 
     def host_difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """`difference` of states (..., nx) on the host, in float64, (..., ndx)."""
@@ -148,7 +156,10 @@ class Dynamics:
 @register_dataclass
 @dataclass(frozen=True)
 class FunctionDynamics(Dynamics):
-    """Dynamics given as a JAX function f(x (nx,), u (nu,)) -> x_next (nx,) on a vector space."""
+    """Dynamics given as a JAX function f(x (nx,), u (nu,)) -> x_next (nx,) on a vector space.
+
+    f may have a third parameter, `knot`.
+    """
 
     function: Partial
     dt: float
@@ -159,8 +170,11 @@ class FunctionDynamics(Dynamics):
         """f(x, u), (nx,)."""
         return self.function(x, u)
 
+    def at(self, knot: Knot) -> Self:
+        """The same at one knot."""
+        function: Any = at_knot(self.function, knot)
+        return replace(self, function=function)
+
     def in_float64(self) -> FunctionDynamics:
         """The same with a function that has not been traced in float32."""
-        f = self.function
-        function = Partial(rollout.untraced(f.func), *f.args, **f.keywords)
-        return replace(self, function=function)
+        return replace(self, function=in_float64(self.function))

@@ -25,10 +25,15 @@ from mjx_drax.base.numbers import vector
 from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass, with_host_fields
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.cost import Constraint, Cost
+from mjx_drax.problem.data import later
+from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.rollout import in_double
 from mjx_drax.problem.tracing import require_shape
-from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory, Values
+from mjx_drax.problem.trajectory import Box, Knot, Stagewise, Trajectory, Values
+
+STEP = "the dynamics f(x, u)"
+"""What messages call f."""
 
 CLOSE = 0.03
 """Least factor on the scatter of initial knots of chains that start nearer to x_init."""
@@ -53,11 +58,15 @@ class Problem:
         scatter: the box that initial knots are drawn from, uniformly.
         horizon: K, number of control knots.
         near: share of the chains that start nearer to x_init than the scatter.
+        data: numbers for every knot, arrays (K + 1, ...); or None.
+        t_init: time of x_0 [s].
         goal: what a replay must reach: a test of dynamics.observe_replayed(x_K), or None.
         guess: draws the initial knots of one chain from a key, instead of `scatter`; or None.
+        data_at: the function of time that `data` comes from, if any.
         name: what files and tables call it.
 
-    The last three are read on the host only: another one does not recompile.
+    The last four are read on the host only: another one does not recompile. Functions with a
+    parameter `knot` receive a `Knot`; `at` binds all functions to one.
     """
 
     dynamics: Dynamics
@@ -70,14 +79,46 @@ class Problem:
     scatter: Box
     horizon: int = field(metadata=Static)
     near: float = field(default=0.0, metadata=Static)
+    data: Any = None
+    t_init: Any = 0.0
     goal: Callable[[Any], Any] | None = field(default=None, metadata=HostOnly)
     guess: Callable[[Array], Trajectory] | None = field(default=None, metadata=HostOnly)
+    data_at: Callable[[Any], Any] | None = field(default=None, metadata=HostOnly)
     name: str = field(default="problem", metadata=HostOnly)
 
     @property
     def times(self) -> np.ndarray:
         """Times of x_0..x_K, (K + 1,) [s]."""
-        return float(self.dynamics.dt) * np.arange(self.horizon + 1)
+        return float(self.t_init) + float(self.dynamics.dt) * np.arange(self.horizon + 1)
+
+    @property
+    def knots(self) -> Knot:
+        """Time, number and data of knots 0..K."""
+        k, dt = jnp.arange(self.horizon + 1), jnp.asarray(self.dynamics.dt, self.x_init.dtype)
+        first = jnp.round(self.t_init / dt).astype(k.dtype)
+        return Knot(self.t_init + dt * k, first + k, jnp.broadcast_to(dt, k.shape), self.data)
+
+    def at(self, knot: Knot) -> Problem:
+        """The problem with all functions of a stage, or of the end, bound to one knot."""
+        return replace(
+            self,
+            dynamics=self.dynamics.at(knot),
+            running=self.running.at(knot),
+            terminal=self.terminal.at(knot),
+            constraint=self.constraint.at(knot),
+            terminal_constraint=self.terminal_constraint.at(knot),
+        )
+
+    @property
+    def end(self) -> Problem:
+        """The problem at its last knot."""
+        return self.at(self.knots.at(-1))
+
+    def seen(self, x: Array, u: Array | None = None) -> tuple[Any, ...]:
+        """What functions of a stage are called with, and those of the end if there is no u."""
+        if u is None:
+            return (self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)),)
+        return self.dynamics.observe(x, u), u
 
     @property
     def precision(self) -> int:
@@ -91,24 +132,26 @@ class Problem:
     # Of all that `observe` computes, these four keep what their readers read
 
     @pruned
-    def running_cost(self, x: Array, u: Array) -> Array:
-        """l(x, u), scalar."""
-        return self.running(self.dynamics.observe(x, u), u)
+    def running_cost(self, x: Array, u: Array, knot: Knot | None = None) -> Array:
+        """l(x, u) at a knot, by default the first, scalar."""
+        here = self.at(self.knots.at(0) if knot is None else knot)
+        return here.running(*here.seen(x, u))
 
     @pruned
     def terminal_cost(self, x: Array) -> Array:
         """phi(x), scalar."""
-        return self.terminal(self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)))
+        return self.end.terminal(*self.end.seen(x))
 
     @pruned
-    def running_constraint(self, x: Array, u: Array) -> Array:
-        """Constraints at a stage, [equality; inequality], (m,)."""
-        return self.constraint(self.dynamics.observe(x, u), u)
+    def running_constraint(self, x: Array, u: Array, knot: Knot | None = None) -> Array:
+        """Constraints at a stage, by default the first, [equality; inequality], (m,)."""
+        here = self.at(self.knots.at(0) if knot is None else knot)
+        return here.constraint(*here.seen(x, u))
 
     @pruned
     def end_constraint(self, x: Array) -> Array:
         """Constraints at the end, [equality; inequality], (m_end,)."""
-        return self.terminal_constraint(self.dynamics.observe(x, jnp.zeros(self.dynamics.nu)))
+        return self.end.terminal_constraint(*self.end.seen(x))
 
     def with_start(self, trajectory: Trajectory) -> Array:
         """x_0..x_K, (..., K + 1, nx): the states with x_init in front."""
@@ -116,13 +159,13 @@ class Problem:
         start = jnp.broadcast_to(self.x_init, (*x.shape[:-2], 1, x.shape[-1]))
         return jnp.concatenate([start, x], axis=-2)
 
-    def stages(self, trajectory: Trajectory) -> Array:
-        """x_0..x_{K-1} (K, nx): the states that the controls act on."""
-        return self.with_start(trajectory)[:-1]
+    def stages(self, trajectory: Trajectory) -> tuple[Array, Array, Knot]:
+        """x_0..x_{K-1} (K, nx), the controls (K, nu) that act on them, and their knots."""
+        return self.with_start(trajectory)[:-1], trajectory.u, self.knots.at(slice(-1))
 
     def costs(self, trajectory: Trajectory) -> Array:
         """l(x_k, u_k) and phi(x_K), (K + 1,)."""
-        running = jax.vmap(self.running_cost)(self.stages(trajectory), trajectory.u)
+        running = jax.vmap(self.running_cost)(*self.stages(trajectory))
         return jnp.append(running, self.terminal_cost(trajectory.x[-1]))
 
     def cost(self, trajectory: Trajectory) -> Array:
@@ -133,14 +176,14 @@ class Problem:
     def defects(self, trajectory: Trajectory) -> Array:
         """h_k = f(x_k, u_k) - x_{k+1} in the tangent space at x_{k+1}, (K, ndx)."""
 
-        def defect(x: Array, u: Array, x_next: Array) -> Array:
-            return self.dynamics.difference(self.dynamics.step(x, u), x_next)
+        def defect(x: Array, u: Array, knot: Knot, x_next: Array) -> Array:
+            return self.dynamics.difference(self.dynamics.at(knot).step(x, u), x_next)
 
-        return jax.vmap(defect)(self.stages(trajectory), trajectory.u, trajectory.x)
+        return jax.vmap(defect)(*self.stages(trajectory), trajectory.x)
 
     def constraints(self, trajectory: Trajectory) -> Stagewise:
         """Values [equality; inequality] at the stages (K, m) and at the end (m_end,)."""
-        stages = jax.vmap(self.running_constraint)(self.stages(trajectory), trajectory.u)
+        stages = jax.vmap(self.running_constraint)(*self.stages(trajectory))
         return Stagewise(stages, self.end_constraint(trajectory.x[-1]))
 
     def inequalities(self, trajectory: Trajectory) -> Stagewise | None:
@@ -227,7 +270,7 @@ class Problem:
         limits = np.asarray(self.bounds.u_lower, float), np.asarray(self.bounds.u_upper, float)
         plan, u, gains = (np.asarray(given, float) for given in (plan, u, gains))
         with self.arithmetic():
-            return self.dynamics.replay(plan, u, gains, limits)
+            return self.dynamics.replay(plan, u, gains, limits, self.knots.at(slice(-1)))
 
     def reached(self, x: np.ndarray) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.
@@ -238,7 +281,7 @@ class Problem:
         if self.goal is None:
             return None
         try:
-            reached = np.asarray(self.goal(self.dynamics.observe_replayed(x)))
+            reached = np.asarray(self.goal(self.end.dynamics.observe_replayed(x)))
         except Exception as error:
             raise DraxError(
                 f"goal failed at x = {shown(x.tolist())}: {reason(error)}. Make it a function of "
@@ -290,6 +333,31 @@ class Problem:
             )
         return self.in_float64()
 
+    def with_data(self, data: Any) -> Problem:
+        """The same problem with other data for its knots: arrays, or a function of time [s].
+
+        Of the same shapes, they do not recompile.
+
+        Raises:
+            DraxError: they do not fit.
+        """
+        found = data_rows(data, self.times)
+        return checked(replace(self, data=found, data_at=data if callable(data) else None))
+
+    def at_time(self, t_init: float) -> Problem:
+        """The same problem with x_0 at another time [s].
+
+        Data that came from a function are taken from it anew; arrays move by whole knots, and stay
+        at their last row behind their end.
+        """
+        by = (t_init - float(self.t_init)) / float(self.dynamics.dt)
+        moved = replace(self, t_init=jnp.asarray(t_init, self.x_init.dtype))
+        if self.data is None:
+            return moved
+        if self.data_at is not None:
+            return replace(moved, data=data_rows(self.data_at, moved.times))
+        return replace(moved, data=later(self.data, round(by)))
+
     def with_x_init(self, x_init: ArrayLike) -> Problem:
         """The same problem from another initial state (nx,).
 
@@ -326,7 +394,7 @@ def checked(problem: Problem) -> Problem:
     if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
         raise DraxError(f"{name} has no cost: give a running or a terminal one.")
     for label, function, arguments, shape in functions_of(problem):
-        if function != dynamics.step or not dynamics.checked:  # tracing MJX takes a second
+        if label != STEP or not dynamics.checked:  # tracing MJX takes a second
             require_shape(label, function, arguments, shape)
     _check_guess(problem)
     problem.reached(np.asarray(problem.x_init, float))
@@ -371,15 +439,17 @@ def _check_bounds(problem: Problem, start: np.ndarray) -> None:
 
 
 def functions_of(
-    problem: Problem,
+    problem: Problem, knot: Knot | None = None
 ) -> list[tuple[str, Callable[..., Any], tuple[Any, ...], tuple[int, ...] | None]]:
     """The functions of a problem: label, function, what it is called with, and shape if known.
 
-    What it is called with has shapes and no values.
+    What it is called with has shapes and no values. All are bound to one knot, by default the
+    first.
     """
+    problem = problem.at(problem.knots.at(0) if knot is None else knot)
     dynamics, dtype = problem.dynamics, problem.x_init.dtype
     x, u = (jax.ShapeDtypeStruct((size,), dtype) for size in (dynamics.nx, dynamics.nu))
-    found: list[Any] = [("the dynamics f(x, u)", dynamics.step, (x, u), (dynamics.nx,))]
+    found: list[Any] = [(STEP, dynamics.step, (x, u), (dynamics.nx,))]
     seen = jax.eval_shape(dynamics.observe, x, u)
     for when, cost, constraint, arguments in (
         ("running", problem.running, problem.constraint, (seen, u)),

@@ -23,11 +23,13 @@ def replay(
     u: np.ndarray,
     gains: np.ndarray,
     limits: tuple[np.ndarray, np.ndarray],
+    knots: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
     """`Dynamics.replay`, by f."""
     with jax.enable_x64(True):
         step, difference, own = _in_float64(dynamics, "step", "difference")
-        ran = _replay(step, difference, own, *jax.tree.map(in_double, (plan, u, gains, limits)))
+        given = jax.tree.map(in_double, (plan, u, gains, limits, knots))
+        ran = _replay(step, difference, own, *given)
         return np.asarray(ran[0]), np.asarray(ran[1])
 
 
@@ -62,10 +64,19 @@ def _replay(
     u: Array,
     gains: Array,
     limits: tuple[Array, Array],
+    knots: Any,
 ) -> tuple[Array, Array]:
     lower, upper = (jnp.broadcast_to(side, u.shape[1:]) for side in limits)
-    one = partial(follow, partial(step, dynamics), partial(difference, dynamics))
-    return jax.vmap(partial(one, limits=(lower, upper)))(plan, u, gains)
+
+    def one(plan: Array, u: Array, gains: Array, knots: Any) -> tuple[Array, Array]:
+        def advance(x: Array, u: Array, knot: Any) -> Array:
+            return step(dynamics.at(knot), x, u)
+
+        limits = lower, upper
+        return follow(advance, partial(difference, dynamics), plan, u, gains, limits, knots)
+
+    each = 0 if knots.time.ndim == 2 else None
+    return jax.vmap(one, in_axes=(0, 0, 0, each))(plan, u, gains, knots)
 
 
 def follow(
@@ -75,24 +86,26 @@ def follow(
     u: Array,
     gains: Array,
     limits: tuple[Array, Array],
+    knots: Any,
 ) -> tuple[Array, Array]:
     """The states x_0..x_K (K + 1, nx) and controls (K, nu) of one chain's plan under feedback.
 
     Args:
-        step, difference: f(x, u), and x - y in the tangent space at y.
+        step, difference: f(x, u) at a knot, and x - y in the tangent space at y.
         plan: planned states (K + 1, nx), of which the first is where it starts.
         u: planned controls (K, nu).
         gains: K_k in u_k + K_k (x_k - planned x_k), (K, nu, ndx).
         limits: of controls, below and above, each (K, nu).
+        knots: of the K stages.
     """
 
-    def advance(x: Array, stage: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
-        planned, control, gain, low, high = stage
+    def advance(x: Array, stage: tuple[Any, ...]) -> tuple[Array, tuple[Array, Array]]:
+        planned, control, gain, low, high, knot = stage
         control = jnp.clip(control + gain @ difference(x, planned), low, high)
-        x = step(x, control)
+        x = step(x, control, knot)
         return x, (x, control)
 
-    states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, *limits))[1]
+    states, applied = jax.lax.scan(advance, plan[0], (plan[:-1], u, gains, *limits, knots))[1]
     return jnp.concatenate([plan[:1], states]), applied
 
 

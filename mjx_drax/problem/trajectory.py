@@ -1,4 +1,7 @@
-"""Knot points x_1..x_K, u_0..u_{K-1}, the box that they keep to, and what functions are there."""
+"""Knot points x_1..x_K, u_0..u_{K-1}, the box that they keep to, and what functions are there.
+
+A knot has a state, a control, and a `Knot`: its time, its number and the user's data for it.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,29 @@ from numpy.typing import ArrayLike
 from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.base.numbers import numbers
 from mjx_drax.base.pytrees import register_dataclass
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Knot:
+    """What functions with a parameter `knot` receive; for all knots with a leading axis (K + 1,).
+
+    Attributes:
+        time: t_k [s].
+        index: k, counted from time 0.
+        dt: time from here to the next knot [s].
+        data: the user's data for the knot: row k of every array in `data` of the problem.
+    """
+
+    time: Array
+    index: Array
+    dt: Array
+    data: Any = None
+
+    def at(self, which: Any) -> Knot:
+        """One knot of several, or a slice of them."""
+        one: Knot = jax.tree.map(lambda a: a[which], self)
+        return one
 
 
 @register_dataclass

@@ -22,9 +22,9 @@ from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Identity, Metric
 from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.differentiators import Autodiff
-from mjx_drax.problem.problem import Problem, functions_of
+from mjx_drax.problem.problem import STEP, Problem, functions_of
 from mjx_drax.problem.tracing import require_derivatives
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.trajectory import Knot, Trajectory
 
 _POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
 
@@ -139,7 +139,7 @@ def _check_derivatives(flow: Langevin, problem: Problem) -> None:
         return
     dynamics, forward, reverse = problem.dynamics, _in_forward(flow, problem), _in_reverse(flow)
     for label, function, arguments, _ in functions_of(problem):
-        if function == dynamics.step and dynamics.checked:
+        if label == STEP and dynamics.checked:
             continue
         twice = forward and label.endswith("cost")
         require_derivatives(label, function, arguments, forward, twice, reverse)
@@ -244,34 +244,35 @@ def _finite(
         with_f: whether f is tried.
     """
     found = {}
-    for label, function, arguments, _ in functions_of(problem):
-        if function == problem.dynamics.step and not with_f:
+    knots = problem.knots
+    for label, _, arguments, _ in functions_of(problem):
+        if label == STEP and not with_f:
             continue
         at_end = len(arguments) == 1
         order = (2 if label.endswith("cost") else 1) if exact else 0
-        one = _with_slopes(_of_knot(problem, function, at_end), order)
-        orders = jax.vmap(jax.vmap(one))(end if at_end else stages)
+        z = end if at_end else stages
+        which = slice(-1, None) if at_end else slice(z.shape[1])
+        one = partial(_slopes_at, problem, label, order)
+        orders = jax.vmap(jax.vmap(one), in_axes=(0, None))(z, knots.at(which))
         found[label] = [
             jnp.isfinite(each).reshape(*each.shape[:2], -1).all(axis=-1) for each in orders
         ]
     return found
 
 
-def _of_knot(
-    problem: Problem, function: Callable[..., Any], at_end: bool
-) -> Callable[[Array], Array]:
-    """A function of a problem as one of z = [x, u]."""
-    dynamics = problem.dynamics
+def _slopes_at(problem: Problem, label: str, order: int, z: Array, knot: Knot) -> tuple[Array, ...]:
+    """A function of a problem at z = [x, u] and a knot, and its derivatives along (1, ..., 1)."""
+    here = problem.at(knot)
+    _, function, arguments, _ = next(f for f in functions_of(problem, knot) if f[0] == label)
 
     def value(z: Array) -> Array:
-        x, u = jnp.split(z, [dynamics.nx])
-        if function == dynamics.step:
-            return dynamics.step(x, u)
-        if at_end:
-            return jnp.asarray(function(dynamics.observe(x, jnp.zeros_like(u))), float)
-        return jnp.asarray(function(dynamics.observe(x, u), u), float)
+        x, u = jnp.split(z, [here.dynamics.nx])
+        if label == STEP:
+            return here.dynamics.step(x, u)
+        seen = here.seen(x, u) if len(arguments) == 2 else here.seen(x)
+        return jnp.asarray(function(*seen), float)
 
-    return value
+    return _with_slopes(value, order)(z)
 
 
 def _with_slopes(

@@ -207,7 +207,7 @@ class Family:
         self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """`Problem.replay` of those problems' plans, as many of each, problem by problem."""
-        if not self.varies("dynamics", "bounds"):
+        if not self.varies("dynamics", "bounds", "data", "t_init"):
             return self.problem.replay(plan, u, gains)
         parts = (np.split(a, len(indices)) for a in (plan, u, gains))
         ran = [self.at(int(i)).replay(*own) for i, *own in zip(indices, *parts, strict=True)]

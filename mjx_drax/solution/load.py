@@ -291,6 +291,7 @@ def _made(summary: dict[str, Any], arrays: Arrays) -> Problem:
         bounds=_box("problem.bounds", arrays),
         scatter=_box("problem.scatter", arrays),
         horizon=summary["horizon"],
+        t_init=jnp.asarray(arrays.get("problem.t_init", 0.0), x_init.dtype),
         goal=_missing("the goal") if summary["has_goal"] else None,
         name=summary["task"],
     )

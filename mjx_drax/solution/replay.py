@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from mjx_drax.problem.problem import Problem
@@ -209,7 +210,10 @@ def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violati
     """
     dynamics, steps = problem.dynamics, np.stack([plan[:-1], plan[1:]], axis=1)
     free, gains = np.array(np.inf), np.zeros((len(u), 1, dynamics.nu, dynamics.ndx))
-    ran, _ = dynamics.replay(steps, np.asarray(u, float)[:, None], gains, (-free, free))
+    with problem.arithmetic():
+        knots = jax.tree.map(lambda a: a[:, None], problem.knots.at(slice(-1)))
+        given = np.asarray(u, float)[:, None]
+        ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
     off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
     off = np.nan_to_num(off, nan=np.inf)
     knot, entry = np.unravel_index(int(off.argmax()), off.shape)

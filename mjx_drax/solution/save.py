@@ -165,6 +165,7 @@ def _whole(solution: Results) -> dict[str, np.ndarray]:
     parts = {
         **{f"solution.{name}": getattr(solution, name) for name in WHOLE},
         "problem.x_init": problem.x_init,
+        "problem.t_init": problem.t_init,
         "problem.bounds": problem.bounds,
         "problem.scatter": problem.scatter,
     }

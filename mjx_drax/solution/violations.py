@@ -401,7 +401,8 @@ def _constraints(
     def values(step: Array) -> tuple[Array, Array]:
         dx, du = step[:ndx], step[ndx:]
         moved = jax.vmap(lambda x: problem.dynamics.integrate(x, dx))(states)
-        stages = jax.vmap(problem.running_constraint)(moved[:-1], u + du)
+        knots = problem.knots.at(slice(-1))
+        stages = jax.vmap(problem.running_constraint)(moved[:-1], u + du, knots)
         return stages, problem.end_constraint(moved[-1])
 
     # One after the other: all at once would take sixteen times the memory

@@ -105,7 +105,7 @@ def test_float64_stays_float64():
         assert {a.dtype for a in (policy.latest.x, policy.latest.u, policy.latest.gains)} == {
             np.dtype(float)
         }
-        weight = policy.problem.running.residual.args[-1]
+        weight = policy.problem.running.residual.args[0].args[-1]
         assert weight == np.sqrt(DT)  # of `hold`, to the last bit
 
 

@@ -139,4 +139,4 @@ def test_nothing_is_learned_from_standing_still_or_from_rounding():
     found = derivatives(problem, far, multipliers)
     still = secant.updated(problem, far, found, multipliers, learns=jnp.asarray(False))
     np.testing.assert_array_equal(still.B, secant.B)
-    np.testing.assert_array_equal(still.x, problem.stages(far))
+    np.testing.assert_array_equal(still.x, problem.with_start(far)[:-1])

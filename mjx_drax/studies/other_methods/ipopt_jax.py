@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.studies.other_methods.ipopt import require_casadi
 
 OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": 500}
@@ -270,24 +270,27 @@ def _pattern(pairs: Any, upper: bool = False) -> Pattern:
     return Pattern(rows, columns, keep & (rows <= columns) if upper else keep)
 
 
-def _stages(problem: Problem, knots: Trajectory) -> Array:
-    """(x_k, u_k) of every stage, (K, nx + nu)."""
-    return jnp.concatenate([problem.stages(knots), knots.u], axis=1)
+def _stages(problem: Problem, knots: Trajectory) -> tuple[Array, Knot]:
+    """(x_k, u_k) of every stage, (K, nx + nu), and its knot."""
+    x, u, at = problem.stages(knots)
+    return jnp.concatenate([x, u], axis=1), at
 
 
-def _cost(problem: Problem, y: Array) -> Array:
-    return problem.running_cost(*jnp.split(y, [problem.dynamics.nx]))
+def _cost(problem: Problem, y: Array, knot: Knot) -> Array:
+    x, u = jnp.split(y, [problem.dynamics.nx])
+    return problem.running_cost(x, u, knot)
 
 
-def _constraints(problem: Problem, y: Array) -> Array:
+def _constraints(problem: Problem, y: Array, knot: Knot) -> Array:
     """f(x_k, u_k) and the constraints of a stage, (nx + m,)."""
     x, u = jnp.split(y, [problem.dynamics.nx])
-    return jnp.concatenate([problem.dynamics.step(x, u), problem.running_constraint(x, u)])
+    f = problem.dynamics.at(knot).step
+    return jnp.concatenate([f(x, u), problem.running_constraint(x, u, knot)])
 
 
 @jax.jit
 def _values(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
-    found = jax.vmap(partial(_constraints, problem))(_stages(problem, knots))
+    found = jax.vmap(partial(_constraints, problem))(*_stages(problem, knots))
     nx = problem.dynamics.nx
     defects = found[:, :nx] - knots.x
     end = problem.end_constraint(knots.x[-1])
@@ -297,7 +300,7 @@ def _values(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
 
 @jax.jit
 def _gradient(problem: Problem, knots: Trajectory) -> Trajectory:
-    stage = jax.vmap(jax.grad(partial(_cost, problem)))(_stages(problem, knots))
+    stage = jax.vmap(jax.grad(partial(_cost, problem)))(*_stages(problem, knots))
     end = jax.grad(problem.terminal_cost)(knots.x[-1])
     x, u = jnp.split(stage, [problem.dynamics.nx], axis=1)
     return Trajectory(jnp.concatenate([x[1:], end[None]]), u)
@@ -305,7 +308,7 @@ def _gradient(problem: Problem, knots: Trajectory) -> Trajectory:
 
 @jax.jit
 def _jacobian(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
-    stage = jax.vmap(jax.jacfwd(partial(_constraints, problem)))(_stages(problem, knots))
+    stage = jax.vmap(jax.jacfwd(partial(_constraints, problem)))(*_stages(problem, knots))
     return stage, jax.jacfwd(problem.end_constraint)(knots.x[-1])
 
 
@@ -313,11 +316,11 @@ def _jacobian(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
 def _hessian(
     problem: Problem, knots: Trajectory, weight: Array, forces: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    def stage(y: Array, force: Array) -> Array:
-        return weight * _cost(problem, y) + force @ _constraints(problem, y)
+    def stage(y: Array, knot: Knot, force: Array) -> Array:
+        return weight * _cost(problem, y, knot) + force @ _constraints(problem, y, knot)
 
     def end(x: Array) -> Array:
         return weight * problem.terminal_cost(x) + forces[1] @ problem.end_constraint(x)
 
-    blocks = jax.vmap(jax.hessian(stage))(_stages(problem, knots), jnp.asarray(forces[0]))
+    blocks = jax.vmap(jax.hessian(stage))(*_stages(problem, knots), jnp.asarray(forces[0]))
     return blocks, jax.hessian(end)(knots.x[-1])

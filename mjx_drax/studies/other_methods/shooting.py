@@ -28,7 +28,7 @@ from jax.typing import ArrayLike
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.trajectory import Knot, Trajectory
 
 REPORTS = 25
 """Times at which the cheapest rollouts are looked at."""
@@ -180,11 +180,13 @@ def advance(
 def rollout(problem: Problem, u: Array) -> Trajectory:
     """The knots that controls u (K, nu) lead to from x_init."""
 
-    def step(x: Array, u: Array) -> tuple[Array, Array]:
-        x = problem.dynamics.step(x, u)
+    def step(x: Array, stage: tuple[Array, Knot]) -> tuple[Array, Array]:
+        u, knot = stage
+        x = problem.dynamics.at(knot).step(x, u)
         return x, x
 
-    return Trajectory(jax.lax.scan(step, problem.x_init, u)[1], u)
+    knots = problem.knots.at(slice(-1))
+    return Trajectory(jax.lax.scan(step, problem.x_init, (u, knots))[1], u)
 
 
 def average(v: Array, cost: Array, temperature: ArrayLike) -> Array:

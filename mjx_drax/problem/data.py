@@ -1,0 +1,75 @@
+"""Numbers that users give for each knot: references, weights that switch, obstacles that move.
+
+They are arrays with one row for each of the knots 0..K, in any pytree, or a function of time [s]
+that returns such a pytree for one knot. All are traced: other numbers do not recompile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax.base.errors import DraxError, shown
+from mjx_drax.problem.tracing import plain
+
+
+def rows(data: Any, times: np.ndarray) -> Any:
+    """The user's data as arrays with a row for each of the times (K + 1,).
+
+    Raises:
+        DraxError: a function that fails or cannot be traced, arrays of another length, or what is
+            no number.
+    """
+    if data is None:
+        return None
+    if callable(data):
+        return _of_function(data, times)
+    count = len(times)
+
+    def row(path: Any, leaf: Any) -> Any:
+        name = "data" + jax.tree_util.keystr(path)
+        try:
+            array = np.asarray(leaf)
+            if array.dtype.kind not in "biuf":
+                raise ValueError(f"numbers of type {array.dtype}")
+        except Exception as error:
+            raise DraxError(
+                f"{name} is {shown(leaf)}: give arrays of numbers, a row for each of {count} knots."
+            ) from error
+        if array.ndim == 0 or len(array) != count:
+            raise DraxError(
+                f"{name} has shape {array.shape}: give {count} rows, one for each of the knots "
+                f"0..{count - 1}, or a function of time."
+            )
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DraxError(
+                f"{name} is not finite in row {int(np.argwhere(~np.isfinite(array))[0][0])}: give "
+                "numbers."
+            )
+        return jnp.asarray(array)
+
+    return jax.tree_util.tree_map_with_path(row, data)
+
+
+def _of_function(data: Callable[[Any], Any], times: np.ndarray) -> Any:
+    try:
+        found = jax.vmap(data)(jnp.asarray(times, float))
+    except Exception as error:
+        raise DraxError(
+            f"data failed when it was traced: {plain(error)}. Make it a JAX function of the time, "
+            "one number, or give arrays with a row for each knot."
+        ) from error
+    return rows(found, times)
+
+
+def later(data: Any, by: int) -> Any:
+    """Arrays `by` rows later; the last row stays."""
+
+    def shift(array: Any) -> Any:
+        return array[np.clip(np.arange(len(array)) + by, 0, len(array) - 1)]
+
+    return jax.tree.map(shift, data)
