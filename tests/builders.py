@@ -65,6 +65,28 @@ def point(**changes):
     return from_function(**{**given, **changes})
 
 
+DT, K = 0.1, 20
+"""Of `double_integrator`."""
+
+
+def double_integrator(f=None, **changes):
+    """x = [p, v] pushed by u."""
+    given = {"x_init": [0.0, 0.0], "nu": 1, "dt": DT, "horizon": K * DT, "name": "cart"}
+    return from_function(f or (lambda x, u: x + DT * jnp.stack([x[1], u[0]])), **given | changes)
+
+
+def matrices(push=None):
+    """G and c of x_1..x_K = G u + c for the double integrator with an acceleration push (K,)."""
+    A, B = np.array([[1, DT], [0, 1.0]]), np.array([0, DT])
+    G, c = np.zeros((K, 2, K)), np.zeros((K, 2))
+    push = np.zeros(K) if push is None else push
+    for k in range(K):
+        before = (G[k - 1], c[k - 1]) if k else (np.zeros((2, K)), np.zeros(2))
+        G[k], c[k] = A @ before[0], A @ before[1] + B * push[k]
+        G[k, :, k] += B
+    return G, c
+
+
 def robot(model=None, **changes):
     """A problem from MJCF; the defaults are good."""
     given = {"horizon": 0.1, "terminal_residual": lambda data: data.qpos}

@@ -50,6 +50,7 @@ from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.rollout import follow
 from mjx_drax.problem.trajectory import Knot, Trajectory
@@ -202,6 +203,11 @@ class MPC:
             raise DraxError(
                 f"bounds of {problem.name} differ from knot to knot, but the horizon recedes: "
                 "give the same ones for all, of shapes (nx,) and (nu,)."
+            )
+        if problem.free or isinstance(problem.dynamics, Extended):
+            raise DraxError(
+                f"{problem.name} leaves x_0, parameters or its duration open, or reads rates: MPC "
+                "starts where the robot is and keeps dt; give a problem without."
             )
         self.original, self.problem = problem, holding(problem, hold)
         self.solver = settled(self.problem, chains, seed, solver)

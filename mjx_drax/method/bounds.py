@@ -75,6 +75,8 @@ class Bounds:
 
         logs = jax.tree.map(log_slacks, trajectory, *self.barred(box).sides(trajectory))
         knots = logs.x + logs.u
+        if logs.start is not None:
+            knots = knots.at[0].add(logs.start)
         if logs.slack is not None:
             knots = (knots + logs.slack.stage).at[-1].add(logs.slack.terminal)
         return -knots

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.bounds import Bounds
-from mjx_drax.method.model import Multipliers, augmented_lagrangian
+from mjx_drax.method.model import Multipliers, penalized
 from mjx_drax.method.schedules import Weights
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory, Values
@@ -50,6 +50,23 @@ def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     outside = problem.bounds.violation(trajectory)
     unknown = jnp.full_like(outside, jnp.nan)
     return Info(values.cost, problem.worst(values), outside, unknown)
+
+
+def augmented_lagrangian(
+    problem: Problem,
+    bounds: Any,
+    trajectory: Trajectory,
+    multipliers: Multipliers,
+    weights: Weights,
+    values: Values,
+) -> Array:
+    """L_mu as one term per stage, (K + 1,), of a trajectory where functions have these values.
+
+    Two trajectories are compared by summing the differences of their terms, which keeps far more
+    digits in float32 than the difference of their sums.
+    """
+    barrier = weights.barrier * bounds.value(problem.bounds, trajectory)
+    return jnp.append(barrier, 0.0) + penalized(problem, trajectory, values, multipliers, weights)
 
 
 def line_search(

@@ -30,7 +30,7 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels.linalg import transposed_product
 from mjx_drax.method.metrics import Direction, Metric
 from mjx_drax.method.model import Derivatives, Model, Multipliers, QuadraticCost
-from mjx_drax.method.riccati import White, newton
+from mjx_drax.method.riccati import Start, White, newton_with_start
 from mjx_drax.problem.differentiators import Autodiff, Differentiator
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
@@ -71,21 +71,24 @@ class GaussNewton(Metric):
         damping = model.weights.damping
         cost, stages, end = with_constraints(cost, derivatives, model, penalties, damping)
         white, xi = (None, None) if key is None else _white(problem, stages, end, key)
-        step = newton(derivatives.dynamics, cost, multipliers.dynamics, mu, white)
-        slack = model.gradient.slack
+        start = start_of(model, key)
+        step = newton_with_start(derivatives.dynamics, cost, multipliers.dynamics, mu, white, start)
+        slack, first = model.gradient.slack, step.first
         ds, rate = jax.vmap(partial(slack_step, penalty=penalties.stage))(
-            stages, stage_steps(step.dx, step.du)
+            stages, stage_steps(step.dx, step.du, None if first is None else first[:, 0])
         )
         ds_end, rate_end = slack_step(end, step.dx[-1], penalties.terminal)
-        drift = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if slack else None)
+        drift = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if slack else None, step.start)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
         if xi is None:
             return Direction(drift, None, rates, step.K, memory)
+        assert step.nx is not None  # for the type checker
+        assert step.nu is not None
         ns = jax.vmap(partial(slack_noise, penalty=penalties.stage))(
-            stages, stage_steps(step.nx, step.nu), xi.stage
+            stages, stage_steps(step.nx, step.nu, None if first is None else first[:, 1]), xi.stage
         )
         ns_end = slack_noise(end, step.nx[-1], xi.terminal, penalties.terminal)
-        noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None)
+        noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None, step.nstart)
         return Direction(drift, noise, rates, step.K, memory)
 
 
@@ -139,7 +142,7 @@ def _with_barrier(
     damping: Array,
     of_states: ArrayLike,
 ) -> QuadraticCost:
-    """The model of c + rho b + delta/2 (|du|^2 + of_states |dx|^2); x_0 is fixed: no barrier."""
+    """The model of c + rho b + delta/2 (|du|^2 + of_states |dx|^2); x_0 has no barrier here."""
     diagonal_x = jnp.full_like(cost.gx, of_states * damping).at[1:].add(curvature.x)
     diagonal_u = damping + curvature.u
     return QuadraticCost(
@@ -207,7 +210,17 @@ def _white(
     )
 
 
-def stage_steps(dx: Array, du: Array) -> Array:
-    """(dx_k, du_k) for k = 0..K-1, (K, ndx + nu), from steps of x_1..x_K; dx_0 = 0."""
-    before = jnp.concatenate([jnp.zeros_like(dx[:1]), dx[:-1]])
+def start_of(model: Model, key: Array | None = None) -> Start | None:
+    """The part of a free x_0, with noise if there is a key to draw it with."""
+    if model.start is None:
+        return None
+    slope, curvature = (jnp.asarray(of_barrier.start) for of_barrier in model.barrier)
+    white = None if key is None else jax.random.normal(jax.random.fold_in(key, 4), slope.shape)
+    return Start(model.start, slope, curvature, white)
+
+
+def stage_steps(dx: Array, du: Array, first: Array | None = None) -> Array:
+    """(dx_k, du_k) for k = 0..K-1, (K, ndx + nu), from steps of x_1..x_K and of x_0, if any."""
+    zeroth = jnp.zeros_like(dx[:1]) if first is None else first[None]
+    before = jnp.concatenate([zeroth, dx[:-1]])
     return jnp.concatenate([before, du], axis=1)

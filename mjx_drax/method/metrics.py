@@ -150,4 +150,5 @@ def _diagonal(model: Model) -> Trajectory:
     u = jnp.einsum("kii->ki", cost.Huu)
     u = u + penalty * (jnp.sum(jnp.square(dynamics.B), axis=1) + squares[:, ndx:])
     slack = jax.tree.map(lambda s: jnp.full_like(s, penalty), model.gradient.slack)
-    return Trajectory(x[1:], u, slack)
+    start = None if model.start is None else x[0] @ jnp.square(model.start)
+    return Trajectory(x[1:], u, slack, start)

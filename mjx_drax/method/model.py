@@ -90,6 +90,7 @@ class Model:
         weights: sigma, mu, delta, rho.
         barrier: gradient and diagonal curvature of rho b, shaped like the knots.
         derivatives: at every knot; None where the metric asked for none.
+        start: E (ndx, n0), where x_0 = x_init + E `start` is free; else None.
     """
 
     trajectory: Trajectory
@@ -99,6 +100,7 @@ class Model:
     weights: Weights
     barrier: tuple[Trajectory, Trajectory]
     derivatives: Derivatives | None = None
+    start: Array | None = None
 
 
 def expand(
@@ -128,7 +130,7 @@ def expand(
         slope = jax.tree.map(jnp.add, gradient, barrier[0])
         constraints = problem.with_slack(problem.constraints(trajectory), trajectory.slack)
         h = Multipliers(problem.defects(trajectory), constraints)
-        return Model(trajectory, slope, h, multipliers, weights, barrier)
+        return Model(trajectory, slope, h, multipliers, weights, barrier, start=problem.start_map)
 
     keys = jax.random.split(key, problem.horizon + 1)
     dynamics = linearize(problem, trajectory, by, keys[:-1])
@@ -136,8 +138,9 @@ def expand(
     h = Multipliers(dynamics.h, problem.with_slack(values, trajectory.slack))
     derivatives = Derivatives(dynamics, cost, stage, terminal)
     force = jax.tree.map(lambda m, r: m + weights.penalty * r, replace(multipliers, bounds=None), h)
-    slope = jax.tree.map(jnp.add, slope_of(derivatives, force, trajectory), barrier[0])
-    return Model(trajectory, slope, h, multipliers, weights, barrier, derivatives)
+    E = problem.start_map
+    slope = jax.tree.map(jnp.add, slope_of(derivatives, force, trajectory, E), barrier[0])
+    return Model(trajectory, slope, h, multipliers, weights, barrier, derivatives, E)
 
 
 def linearize(
@@ -197,7 +200,11 @@ def _expand_costs(
 
 
 def slope_of(
-    derivatives: Derivatives, multipliers: Multipliers, knots: Trajectory, sign: float = -1.0
+    derivatives: Derivatives,
+    multipliers: Multipliers,
+    knots: Trajectory,
+    E: Array | None,
+    sign: float = -1.0,
 ) -> Trajectory:
     """grad c + J'lambda in tangent space; with sign = 1, of absolute values, the sum of terms."""
     dynamics, cost, stage, terminal = derivatives
@@ -211,24 +218,8 @@ def slope_of(
     slack = None
     if knots.slack is not None:  # the rows of inequalities, the last ones
         slack = jax.tree.map(lambda s, r: r[..., r.shape[-1] - s.shape[-1] :], knots.slack, rows)
-    return Trajectory(gx[1:] + sign * multipliers.dynamics, gu, slack)
-
-
-def augmented_lagrangian(
-    problem: Problem,
-    bounds: Any,
-    trajectory: Trajectory,
-    multipliers: Multipliers,
-    weights: Weights,
-    values: Values,
-) -> Array:
-    """L_mu as one term per stage, (K + 1,), of a trajectory where functions have these values.
-
-    Two trajectories are compared by summing the differences of their terms, which keeps far more
-    digits in float32 than the difference of their sums.
-    """
-    barrier = weights.barrier * bounds.value(problem.bounds, trajectory)
-    return jnp.append(barrier, 0.0) + penalized(problem, trajectory, values, multipliers, weights)
+    start = None if E is None else gx[0] @ E
+    return Trajectory(gx[1:] + sign * multipliers.dynamics, gu, slack, start)
 
 
 def penalized(

@@ -29,7 +29,7 @@ With thousands of chains on a GPU one kernel does the same, stage by stage (`ker
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -70,11 +70,27 @@ class White:
 
 @register_dataclass
 @dataclass(frozen=True)
+class Start:
+    """What a free x_0 = x_init + E w adds to the quadratic program.
+
+    E (ndx, n0); slope (n0,) and diagonal curvature (n0,) of a barrier on w; white numbers for its
+    noise, (n0,), or None.
+    """
+
+    E: Array
+    slope: Array
+    curvature: Array
+    white: Array | None = None
+
+
+@register_dataclass
+@dataclass(frozen=True)
 class Step:
     """What a chain moves by.
 
     Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise nx, nu alike, or None; the
-    multipliers' step `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx).
+    multipliers' step `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx). Where x_0 is free,
+    w and its noise, (n0,), and the step dx_0 that they make, with noise beside, (ndx, 1 or 2).
     """
 
     dx: Array
@@ -83,12 +99,18 @@ class Step:
     nu: Array | None
     rate: Array
     K: Array
+    start: Array | None = None
+    nstart: Array | None = None
+    first: Array | None = None
 
 
 def factorize(
     model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array
-) -> Factorization:
-    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, at most infinite."""
+) -> tuple[tuple[Array, Array], Factorization]:
+    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, at most infinite.
+
+    Returns P and p of x_0, and the factors of every stage.
+    """
     soft, identity = 1.0 / penalty, jnp.eye(model.A.shape[-1], dtype=model.A.dtype)
 
     def stage(
@@ -111,7 +133,7 @@ def factorize(
 
     inputs = (model.A, model.B, model.h, cost.gx[:-1], cost.gu, cost.Hxx[:-1], cost.Hux, cost.Huu)
     end = cost.Hxx[-1], cost.gx[-1]
-    return jax.lax.scan(stage, end, (*inputs, multipliers), reverse=True)[1]
+    return jax.lax.scan(stage, end, (*inputs, multipliers), reverse=True)
 
 
 def solve_and_sample(
@@ -120,11 +142,13 @@ def solve_and_sample(
     multipliers: Array,
     penalty: Array,
     white: White | None = None,
+    first: Array | None = None,
 ) -> Step:
     """The Newton step d = -M^{-1} grad L_mu, one draw n ~ N(0, M^{-1}), and the multipliers' step.
 
     The draw is of the white numbers; without them there is none. The multipliers' step is the
-    costate P dx + p of the quadratic program less the present multipliers.
+    costate P dx + p of the quadratic program less the present multipliers. `first` is dx_0, with
+    its noise beside it, (ndx, 1 or 2).
     """
 
     def affine(
@@ -144,8 +168,11 @@ def solve_and_sample(
 
     soft = 1.0 / penalty
     F, f = jax.vmap(affine)(model, factors, multipliers, white)
-    after = affine_recursion(F, f)  # dx_1..dx_K since dx_0 = 0
-    before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])
+    if first is not None:
+        f = f.at[0].add(F[0] @ first)
+    after = affine_recursion(F, f)  # dx_1..dx_K, of dx_0 = 0 or with f_0 of the other one
+    zeroth = jnp.zeros_like(after[:1]) if first is None else first[None]
+    before = jnp.concatenate([zeroth, after[:-1]])
     controls = factors.K @ before
     dx, du = after[..., 0], controls[..., 0] + factors.kff
     nx, nu = None, None
@@ -164,5 +191,28 @@ def newton(
     white: White | None = None,
 ) -> Step:
     """Newton step of one chain for multipliers (K, ndx) and penalty mu; noise of `white`."""
-    factors = factorize(model, cost, multipliers, penalty)
+    _, factors = factorize(model, cost, multipliers, penalty)
     return solve_and_sample(model, factors, multipliers, penalty, white)
+
+
+def newton_with_start(
+    model: Linearization,
+    cost: QuadraticCost,
+    multipliers: Array,
+    penalty: Array,
+    white: White | None,
+    start: Start | None,
+) -> Step:
+    """`newton`; where x_0 is free, its step w minimizes 1/2 (E w)'P E w + p'E w + barrier."""
+    if start is None:
+        return newton(model, cost, multipliers, penalty, white)
+    (P, p), factors = factorize(model, cost, multipliers, penalty)
+    L = cholesky(start.E.T @ P @ start.E + jnp.diag(start.curvature))
+    columns = [-solve(L, start.E.T @ p + start.slope)]
+    if start.white is not None:
+        columns.append(solve_upper(L, start.white))
+    w = jnp.column_stack(columns)
+    first = start.E @ w
+    step = solve_and_sample(model, factors, multipliers, penalty, white, first)
+    noise = None if start.white is None else w[:, 1]
+    return replace(step, start=w[:, 0], nstart=noise, first=first)

@@ -108,4 +108,5 @@ def _window(function: Any, begin: Any, end: Any, idle: Any) -> tuple[Any, Array,
             raise DraxError(f"{label} is {shown(value)}: give a finite number.")
     if begin > end:
         raise DraxError(f"the window begins at {begin} s and ends at {end} s: swap them.")
-    return as_partial(function), *(jnp.asarray(value, float) for value in (begin, end, idle))
+    first, last, other = (jnp.asarray(value, float) for value in (begin, end, idle))
+    return as_partial(function), first, last, other

@@ -8,14 +8,15 @@ float64, which steps the `mujoco.MjModel` that the MJX model was made of.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -24,13 +25,16 @@ from mjx_drax.base.pytrees import HostOnly
 from mjx_drax.kernels.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
-from mjx_drax.physics.engine import Rollout, mujoco
+from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
 from mjx_drax.physics.source import Source, binary, model_name
-from mjx_drax.physics.states import difference, integrate, quiet, set_state
+from mjx_drax.physics.states import difference, integrate, set_state
+from mjx_drax.physics.stepper import Stepper
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.extended import Extended
+from mjx_drax.problem.rollout import replay_by
 from mjx_drax.problem.trajectory import Knot
 
 STEP_LIMIT = 2_000
@@ -39,14 +43,6 @@ take several times as many, and compilers need minutes for tens of thousands."""
 
 KNOWN_SIZE = 4_096
 """Numbers in an array of a model, above which compiled functions know none of them."""
-
-CHAINS_PER_THREAD = 8
-"""Chains that a thread replays. Threads wait for each other at every knot, which takes longer than
-a few steps do: for 64 chains of a hopper on two cores, 64 threads took five times as long as one.
-"""
-
-_FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
-"""What a step of the C engine starts from: time, state, and what actuators and plugins remember."""
 
 Known = tuple[tuple[int, ...], bytes, bytes]
 """Shape of an array, which of its entries are known, and these; as bytes, which can be hashed."""
@@ -67,10 +63,16 @@ class Structure:
     known: tuple[Known | None, ...]
 
     @classmethod
-    def of(cls, model: mjx.Model) -> Structure:
-        """The structure of a model; nothing is known of the arrays that are traced."""
+    def of(cls, model: mjx.Model, free: frozenset[str] = frozenset()) -> Structure:
+        """The structure of a model; nothing is known of arrays that are traced or `free`."""
         leaves = jax.tree_util.tree_leaves_with_path(model)
-        return cls(tuple(_known(path, leaf) for path, leaf in leaves))
+        names = (str(path[-1]).lstrip(".") for path, _ in leaves)
+        return cls(
+            tuple(
+                None if name in free else _known(path, leaf)
+                for name, (path, leaf) in zip(names, leaves, strict=True)
+            )
+        )
 
     def fixed_in(self, model: mjx.Model) -> mjx.Model:
         """The same model, with constants for the numbers that are known."""
@@ -125,6 +127,9 @@ class MjxDynamics(Dynamics):
         derivatives: how f is differentiated; None: exactly.
         origin: what `mj_model` was compiled from: a file, XML or a `Source`; None if unknown.
         structure: what compiled functions know of the model, found when this is constructed.
+        free_step: whether the timestep is that of the knot, over `substeps`.
+        numbers: numbers(model, parameters) -> {field: array}, of the model, from the parameters of
+            the knot; or None.
         time: of the knot that `at` has bound this to [s]; None if it has not.
     """
 
@@ -135,6 +140,8 @@ class MjxDynamics(Dynamics):
     derivatives: Differentiator | None = None
     origin: str | Path | Source | None = field(default=None, metadata=HostOnly)
     structure: Structure = field(init=False)
+    free_step: bool = False
+    numbers: Callable[[mjx.Model, Any], Any] | None = None
     time: Array | None = field(default=None, init=False)
     checked = True
     twice = False
@@ -205,8 +212,21 @@ class MjxDynamics(Dynamics):
 
     def at(self, knot: Knot) -> Self:
         """The same at one knot: costs read its time."""
-        new = copy(self)  # not `replace`, which would look for the structure anew
+        new, model = copy(self), self.model  # not `replace`: it would look for the structure anew
+        if self.free_step:
+            model = model.replace(opt=model.opt.replace(timestep=knot.dt / self.substeps))
+        if self.numbers is not None:
+            model = model.replace(**self.numbers(model, knot.parameters))
         object.__setattr__(new, "time", knot.time)
+        object.__setattr__(new, "model", model)
+        return new
+
+    def steered(
+        self, free_step: bool, numbers: Callable[[mjx.Model, Any], Any] | None, names: Iterable[str]
+    ) -> MjxDynamics:
+        """The same, with the step or the numbers of the fields `names` given by the knot."""
+        new = replace(self, free_step=free_step, numbers=numbers)
+        object.__setattr__(new, "structure", Structure.of(self.model, frozenset(names)))
         return new
 
     def observe(self, x: Array, u: Array) -> mjx.Data:
@@ -268,48 +288,27 @@ class MjxDynamics(Dynamics):
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`.
 
-        All chains take the same knot before any takes the next. The constraint solver starts
-        without a guess at each knot, so that x_{k+1} depends on x_k and u_k alone; `mj_step` in a
-        loop starts it from the last knot's forces, and differs by the solver's tolerance.
+        All chains take the same knot before any takes the next; see `Stepper`.
         """
-        model = self.mj_model
-        lower, upper = (np.broadcast_to(side, u.shape[1:]) for side in limits)
-        chains, stages = u.shape[:2]
-        states, applied = np.full(plan.shape, np.nan), np.full(u.shape, np.nan)
-        states[:, 0] = plan[:, 0]
-        threads = min(-(-chains // CHAINS_PER_THREAD), os.cpu_count() or 1)
-        models, workers = [model] * chains, [mujoco.MjData(model) for _ in range(threads)]
-        start = np.empty(mujoco.mj_stateSize(model, _FULL_PHYSICS))
-        mujoco.mj_getState(model, workers[0], start, _FULL_PHYSICS)
-        time, x = 0, slice(1, 1 + self.nx)
-        now, sound = np.tile(start, (chains, 1)), np.ones(chains, bool)
-        now[:, x] = plan[:, 0]
-        steps = np.empty((chains, self.substeps, len(start)))
-        with quiet(), Rollout(nthread=threads if threads > 1 else 0) as engine:
-            for k in range(stages):
-                off = self.host_difference(states[:, k], plan[:, k])
-                wanted = u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off)
-                applied[:, k] = np.clip(wanted, lower[k], upper[k])
-                sound &= (np.abs(applied[:, k]) < mujoco.mjMAXVAL).all(axis=1)
-                applied[~sound, k] = np.nan
-                now[~sound] = start  # a state that can be stepped; its result is not used
-                control = np.where(sound[:, None], applied[:, k], 0.0)
-                engine.rollout(
-                    models,
-                    workers,
-                    now,
-                    np.repeat(control[:, None], self.substeps, axis=1),
-                    nstep=self.substeps,
-                    state=steps,
-                    chunk_size=-(-chains // threads),
-                    skip_checks=True,
-                )
-                now = steps[:, -1].copy()
-                sound &= (np.abs(now) < mujoco.mjMAXVAL).all(axis=1)
-                # The engine resets a state that diverges, and its time: it falls behind
-                sound &= now[:, time] > (k + 1) * self.dt - 0.5 * model.opt.timestep
-                states[sound, k + 1] = now[sound, x]
-        return states, applied
+        with self.stepper(plan[:, 0]) as stepper:
+            return replay_by(
+                lambda k, x, u: stepper(u), self.host_difference, plan, u, gains, limits
+            )
+
+    def stepper(self, x: np.ndarray) -> Stepper:
+        """The C engine with states (chains, nx) that advance together."""
+        return Stepper(self.mj_model, self.substeps, x)
+
+    def configured(self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any]) -> None:
+        """Give every chain of a stepper its time between knots [s] and its parameters."""
+        steps = dt / self.substeps if self.free_step else None
+        own: dict[str, np.ndarray] = {}
+        if self.numbers is not None:
+            with jax.enable_x64(True):
+                model = jax.tree.map(jnp.asarray, self.in_float64().model)
+                found = jax.vmap(partial(self.numbers, model))(dict(parameters))
+                own = {name: np.asarray(values, float) for name, values in found.items()}
+        stepper.configure(steps, own)
 
     def host_difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """x - y in tangent space by the C engine, (..., ndx), for states (..., nx)."""
@@ -332,7 +331,8 @@ class MjxDynamics(Dynamics):
         return data
 
 
-_TRACED, _STATIC = ("model", "dt", "derivatives", "time"), ("substeps", "structure")
+_TRACED = ("model", "dt", "derivatives", "time")
+_STATIC = ("substeps", "structure", "free_step", "numbers")
 
 
 def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -358,7 +358,8 @@ def mujoco_model(dynamics: Dynamics) -> mujoco.MjModel | None:
     The one place that asks whether dynamics are MuJoCo's. Not for compiled functions, where the
     model is not known.
     """
-    return dynamics.mj_model if isinstance(dynamics, MjxDynamics) else None
+    inner = dynamics.inner if isinstance(dynamics, Extended) else dynamics
+    return inner.mj_model if isinstance(inner, MjxDynamics) else None
 
 
 def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -24,17 +25,19 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, Joints
 from mjx_drax.physics.mjx_model import free_ranges, kept_contacts, put_model
 from mjx_drax.physics.source import load, model_name, origin_of
-from mjx_drax.problem.build import assembled, knots, require_name, scatter_box
+from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
+from mjx_drax.problem.choices import Choices, phases_of
 from mjx_drax.problem.differentiators import Differentiator
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.tracing import require_functions
+from mjx_drax.problem.tracing import plain, require_functions
 from mjx_drax.problem.trajectory import Box, Trajectory, box
 
 
 def from_mjcf(
     model: str | Path | mujoco.MjModel,
     *,
-    horizon: float,
+    horizon: float | tuple[float, float] | Sequence[tuple[float, float]],
+    knots: int | Sequence[int] | None = None,
     running_cost: Callable[..., Any] | None = None,
     terminal_cost: Callable[..., Any] | None = None,
     running_residual: Callable[..., Any] | None = None,
@@ -51,6 +54,12 @@ def from_mjcf(
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     contacts: bool | int = True,
     derivatives: Differentiator | None = None,
+    x_init_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    parameters: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    model_numbers: Callable[[Any, Any], Mapping[str, Array]] | None = None,
+    rates: int = 0,
+    rate_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    u_init: ArrayLike | None = None,
     data: Any = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
@@ -65,7 +74,10 @@ def from_mjcf(
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
-        horizon: duration [s]; K = horizon / dt knots, rounded.
+        horizon: duration [s]; K = horizon / dt knots, rounded. Or (least, most) of a free one, or a
+            list of such pairs for phases: the model's timestep scales, in the plan and in the C
+            engine.
+        knots: K of a free duration; for phases the number of each.
         running_cost: l(data, u), a scalar, summed over the knots without a factor dt.
         terminal_cost: phi(data), a scalar.
         running_residual: r(data, u) (n,): adds 1/2 |r|^2 to the running cost.
@@ -92,6 +104,15 @@ def from_mjcf(
             keeps all contacts.
         derivatives: of f; by default exact, also in contact. `Smoothed()` fits them to samples,
             which feel a contact that is as far away as the samples are spread.
+        x_init_bounds: (lower, upper) of x_0, which is free where they differ; `knot.x_init`
+            is what was chosen.
+        parameters: {name: (lower, upper)} of numbers that are chosen once for the whole motion;
+            functions read `knot.parameters[name]`.
+        model_numbers: model_numbers(mjx.Model, parameters) -> {field: array}, for parameters that
+            are numbers of the model; the C engine replays the changed model.
+        rates: 1 if functions read `knot.rate`, (u_k - u_{k-1}) / dt; 2 if `knot.jerk` as well.
+        rate_bounds: (lower, upper) of the rate [unit of u / s].
+        u_init: u_{-1}, (nu,); without it the first rate is 0.
         data: numbers for each knot: arrays (K + 1, ...) in any pytree, or a function of a knot's
             time [s] that returns one. Functions with a parameter `knot` read them there.
         goal: goal(mujoco.MjData of the last state) -> bool, what a replay must reach.
@@ -123,11 +144,15 @@ def from_mjcf(
     require_name(name)
     substeps = steps_between_knots(mj_model, dt)
     dt = substeps * mj_model.opt.timestep
-    K = knots(horizon, dt)
+    phases = phases_of(horizon, knots)
+    K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
     x0, bounded = checked_start(mj_model, name, x_init)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
     require_traceable(mj_model, name, dynamics.observe)
+    names = fields_of(dynamics, parameters, model_numbers)
+    if phases or names:
+        dynamics = dynamics.steered(bool(phases), model_numbers, names)
     bounds = _bounds(mj_model, bounded, x_bounds, u_bounds)
     require_same_step(mj_model, name, x0, contacts, bounded)
     warn_of_lost_contacts(mj_model, name, x0, kept_contacts(planned), bounded)
@@ -136,9 +161,49 @@ def from_mjcf(
     if dynamics.kinked or dynamics.nx != dynamics.ndx:
         near = 1.0
     start = jnp.asarray(x0)
+    choices = Choices(x_init_bounds, parameters, phases, rates, u_init, rate_bounds)
     return assembled(
-        dynamics, given, start, bounds, scatter, K, near, data, goal=goal, guess=guess, name=name
+        dynamics,
+        given,
+        start,
+        bounds,
+        scatter,
+        K,
+        near,
+        data,
+        choices,
+        goal=goal,
+        guess=guess,
+        name=name,
     )
+
+
+def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]:
+    """The fields of the model that `model_numbers` returns, tried at the middle of the bounds.
+
+    Raises:
+        DraxError: it fails, or returns what is no field, or has another shape.
+    """
+    if numbers is None:
+        return []
+    require_functions(model_numbers=numbers)
+    if not parameters:
+        raise DraxError("model_numbers is given without parameters: give parameters=..., or none.")
+    give = "a dictionary of fields of mjx.Model, such as {'body_mass': ...}"
+    try:
+        middle = {k: 0.5 * (jnp.asarray(a) + jnp.asarray(b)) for k, (a, b) in parameters.items()}
+        found = dict(jax.eval_shape(numbers, dynamics.model, middle))
+    except Exception as error:
+        raise DraxError(f"model_numbers failed: {plain(error)}. Return {give}.") from error
+    for field, value in found.items():
+        own = getattr(dynamics.model, field, None)
+        if own is None or not hasattr(dynamics.mj_model, field) or own.shape != value.shape:
+            shape = "no such field" if own is None else f"shape {own.shape}"
+            raise DraxError(
+                f"model_numbers returned {field!r} of shape {value.shape}, and the model has "
+                f"{shape}: return {give}."
+            )
+    return list(found)
 
 
 def steps_between_knots(model: mujoco.MjModel, dt: float | None) -> int:

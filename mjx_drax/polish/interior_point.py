@@ -35,15 +35,16 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.bounds import Sides
-from mjx_drax.method.gauss_newton import slack_step, stage_steps, with_constraints
+from mjx_drax.method.gauss_newton import slack_step, stage_steps, start_of, with_constraints
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Model, Multipliers, QuadraticCost
-from mjx_drax.method.riccati import newton
+from mjx_drax.method.riccati import newton_with_start
 from mjx_drax.polish.curvature import with_exact_hessian
 from mjx_drax.polish.residual import (
     STILL,
     Residual,
     Scales,
+    moves_of_start,
     products,
     residual_of,
     row_scales,
@@ -256,10 +257,15 @@ def _inside(problem: Problem, model: Model, scales: Scales) -> Trajectory:
         return jnp.clip(z, a + gap, b - gap)
 
     extent = scales.x if problem.dynamics.ndx == problem.dynamics.nx else jnp.ones(())
+    start = knots.start
+    if model.start is not None:
+        z, a, b = (jnp.asarray(side.start) for side in (knots, lower, upper))
+        start = inside(z, a, b, moves_of_start(model.start, scales.x))
     return Trajectory(
         inside(knots.x, lower.x, upper.x, extent),
         inside(knots.u, lower.u, upper.u, scales.u),
         slack,
+        start,
     )
 
 
@@ -442,13 +448,16 @@ def _direction(
         )
         if learned is not None:
             damped = with_curvature(damped, share * learned)
-        step = newton(derivatives.dynamics, damped, multipliers.dynamics, stiff)
+        present = derivatives.dynamics, damped, multipliers.dynamics, stiff
+        step = newton_with_start(*present, None, start_of(model))
+        first = None if step.first is None else step.first[:, 0]
         ds, rate = jax.vmap(lambda block, dz: slack_step(block, dz, penalties.stage))(
-            stages, stage_steps(step.dx, step.du)
+            stages, stage_steps(step.dx, step.du, first)
         )
         ds_end, rate_end = slack_step(end, step.dx[-1], penalties.terminal)
         has_slack = model.trajectory.slack is not None
-        d = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if has_slack else None)
+        slack = Stagewise(ds, ds_end) if has_slack else None
+        d = Trajectory(step.dx, step.du, slack, step.start)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
         finite = jnp.isfinite(sum(jnp.sum(a) for a in jax.tree.leaves((d, rates))))
         return finite, d, rates, step.K
@@ -519,6 +528,8 @@ def _promised(
     assert model.derivatives is not None
     gradient = model.derivatives.cost
     of_cost = jnp.sum(gradient.gx[1:] * d.x) + jnp.sum(gradient.gu * d.u)
+    if model.start is not None:
+        of_cost = of_cost + jnp.dot(gradient.gx[0], model.start @ jnp.asarray(d.start))
     changes = [
         jnp.sum(e * (jnp.abs(after) - jnp.abs(before)))
         for e, after, before in zip(*map(jax.tree.leaves, (eta, left, model.h)), strict=True)

@@ -92,11 +92,11 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     derivatives, multipliers = model.derivatives, model.multipliers
     assert derivatives is not None  # for the type checker
     knots, tangent = model.trajectory, problem.dynamics.tangent
-    below, above = (Trajectory(tangent(side.x), side.u, side.slack) for side in v)
-    slope = slope_of(derivatives, multipliers, knots)
+    below, above = (replace(side, x=tangent(side.x)) for side in v)
+    slope = slope_of(derivatives, multipliers, knots, model.start)
     absolute = jax.tree.map(jnp.abs, replace(multipliers, bounds=None))
     dual = jax.tree.map(lambda g, a, b: g - a + b, slope, below, above)
-    sizes = slope_of(jax.tree.map(jnp.abs, derivatives), absolute, knots, 1.0)
+    sizes = slope_of(jax.tree.map(jnp.abs, derivatives), absolute, knots, model.start, 1.0)
     sizes = jax.tree.map(lambda s, a, b: s + a + b, sizes, below, above)
 
     box, offset = problem.scatter, jax.vmap(problem.dynamics.difference, (0, None))
@@ -134,6 +134,10 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         forces = jnp.maximum(forces, jnp.abs(part * force).max(initial=0.0))
     slopes = (jnp.abs(dual.x) * x).max(initial=0.0), (jnp.abs(dual.u) * u).max(initial=0.0)
     error = jnp.maximum(forces, jnp.maximum(*slopes))
+    if model.start is not None:
+        extent, peak = (moves_of_start(model.start, z) for z in (x, peaks[0]))
+        stationarity = jnp.maximum(stationarity, relative(dual.start[None], peak, extent))
+        error = jnp.maximum(error, (jnp.abs(dual.start) * extent).max())
     if knots.slack is not None:
         pairs = zip(jax.tree.leaves(dual.slack), jax.tree.leaves(knots.slack), strict=True)
         of_slack = jnp.max(jnp.stack([jnp.abs(g * s).max(initial=0.0) for g, s in pairs]))
@@ -146,6 +150,11 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         gap / cost,
         error,
     ), scales
+
+
+def moves_of_start(E: Array, x: Array) -> Array:
+    """How far the free coordinates of x_0 move, (n0,), given how far those of states do (ndx,)."""
+    return jnp.max(jnp.asarray(E).T * x, axis=1)
 
 
 def row_scales(derivatives: Derivatives, scales: Scales, knots: Trajectory) -> tuple[Array, Array]:

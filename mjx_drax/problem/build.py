@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -13,18 +13,21 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole, shown
 from mjx_drax.base.numbers import vector
-from mjx_drax.problem.cost import as_partial, constraint_of, cost_of
+from mjx_drax.problem.choices import Choices, extend, phases_of
+from mjx_drax.problem.cost import as_partial, constraint_of, cost_of, takes_knot
 from mjx_drax.problem.data import rows
 from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import require_functions
 from mjx_drax.problem.trajectory import Box, Knot, Trajectory, box
 
+NOTHING_OPEN = Choices()
+
 MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
 
-def knots(horizon: float, dt: float) -> int:
+def knots_in(horizon: Any, dt: float) -> int:
     """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
 
     Raises:
@@ -45,13 +48,35 @@ def knots(horizon: float, dt: float) -> int:
     return round(share)
 
 
+def steps(horizon: Any, dt: float | None, count: Any) -> tuple[int, float]:
+    """K and dt of a fixed horizon [s], from one of them.
+
+    Raises:
+        DraxError: both or neither are given, or what is given makes no sense.
+    """
+    if (dt is None) == (count is None):
+        raise DraxError(f"dt is {dt} and knots is {count}: give one of the two.")
+    if dt is not None:
+        return knots_in(horizon, dt), dt
+    require_whole("knots", count)
+    require_positive("horizon", horizon, "a positive number of seconds")
+    return int(count), float(horizon) / int(count)
+
+
+def of_phases(phases: tuple[tuple[float, float, int], ...]) -> tuple[int, float]:
+    """K, and the mean step in the middle of the bounds [s]."""
+    K = sum(count for *_, count in phases)
+    return K, 0.5 * sum(least + most for least, most, _ in phases) / K
+
+
 def from_function(
     f: Callable[[Array, Array], Array] | Dynamics,
     *,
     x_init: ArrayLike,
     nu: int,
-    dt: float,
-    horizon: float,
+    horizon: float | tuple[float, float] | Sequence[tuple[float, float]],
+    dt: float | None = None,
+    knots: int | Sequence[int] | None = None,
     running_cost: Callable[..., Any] | None = None,
     terminal_cost: Callable[..., Any] | None = None,
     running_residual: Callable[..., Any] | None = None,
@@ -64,6 +89,11 @@ def from_function(
     u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
+    x_init_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    parameters: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    rates: int = 0,
+    rate_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    u_init: ArrayLike | None = None,
     data: Any = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
@@ -79,8 +109,10 @@ def from_function(
             `jax.tree_util.Partial`; the same holds for the costs.
         x_init: x_0, (nx,).
         nu: size of a control.
-        dt: control step [s].
-        horizon: duration [s]; K = horizon / dt knots, rounded.
+        horizon: duration [s]; or (least, most) of a free one, or a list of such pairs for phases.
+        dt: control step [s]; K = horizon / dt knots, rounded. Where the duration is free, f takes
+            its step from `knot.dt`.
+        knots: K, instead of dt; for phases the number of each.
         running_cost: l(x, u), a scalar, summed over the knots as it stands.
         terminal_cost: phi(x), a scalar.
         running_residual: r(x, u) (n,): adds 1/2 |r|^2 to the running cost.
@@ -91,6 +123,13 @@ def from_function(
         terminal_inequality: g(x) (m,), held <= 0 at x_K.
         x_bounds: (lower, upper) on every x_k, k >= 1.
         u_bounds: (lower, upper) on every u_k.
+        x_init_bounds: (lower, upper) of x_0, which is free where they differ; `knot.x_init`
+            is what was chosen.
+        parameters: {name: (lower, upper)} of numbers that are chosen once for the whole motion;
+            functions read `knot.parameters[name]`.
+        rates: 1 if functions read `knot.rate`, (u_k - u_{k-1}) / dt; 2 if `knot.jerk` as well.
+        rate_bounds: (lower, upper) of the rate [unit of u / s].
+        u_init: u_{-1}, (nu,); without it the first rate is 0.
         x_scatter: box from which initial states are drawn; by default the bounds, and within
             +-1 of x_init where those are infinite.
         u_scatter: the same for controls; within +-1 of 0 where the bounds are infinite.
@@ -121,7 +160,8 @@ def from_function(
     if nu > MOST:
         raise DraxError(f"nu is {nu}, the size of a control: give at most {MOST:,}.")
     require_name(name)
-    K = knots(horizon, dt)
+    phases = phases_of(horizon, knots)
+    K, dt = of_phases(phases) if phases else steps(horizon, dt, knots)
     start = vector("x_init", x_init)
     nx = start.shape[0]
     bounds = box(nx, nu, x_bounds, u_bounds)
@@ -129,11 +169,28 @@ def from_function(
         dynamics = f
     else:
         require_functions(f=f)
+        if phases and not takes_knot(f):
+            raise DraxError(
+                "the horizon is free, and f has no parameter knot: take the step from it, "
+                "f(x, u, knot) with knot.dt."
+            )
         dynamics = FunctionDynamics(as_partial(f), dt, nx, nu)
     scatter = scatter_box(bounds, start, jnp.ones(nx), x_scatter, u_scatter)
     near = 1.0 if dynamics.kinked or dynamics.nx != dynamics.ndx else 0.0
+    choices = Choices(x_init_bounds, parameters, phases, rates, u_init, rate_bounds)
     return assembled(
-        dynamics, given, start, bounds, scatter, K, near, data, goal=goal, guess=guess, name=name
+        dynamics,
+        given,
+        start,
+        bounds,
+        scatter,
+        K,
+        near,
+        data,
+        choices,
+        goal=goal,
+        guess=guess,
+        name=name,
     )
 
 
@@ -173,6 +230,7 @@ def assembled(
     horizon: int,
     near: float,
     data: Any = None,
+    choices: Choices = NOTHING_OPEN,
     **host: Any,
 ) -> Problem:
     """A problem from its parts, checked.
@@ -186,17 +244,22 @@ def assembled(
         horizon: K.
         near: share of chains that start nearer to x_init.
         data: for each knot, as a user gives it.
+        choices: what is left open.
         host: goal, guess and name.
     """
-    x, u, t_init = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu), jnp.zeros(())
     times = float(dynamics.dt) * np.arange(horizon + 1)
     found = rows(data, times)
     first = jax.tree.map(lambda a: a[0], found)
-    here = Knot(t_init, jnp.zeros((), int), jnp.asarray(dynamics.dt, float), first)
     for label, function in given.items():
         check = getattr(function, "check_knots", None)
         if check is not None:
             check(label, times)
+    free: tuple[tuple[int, ...], ...] = ()
+    if choices.any:
+        parts = extend(choices, dynamics, given, x_init, bounds, scatter)
+        dynamics, given, x_init, bounds, scatter, free = parts
+    x, u, t_init = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu), jnp.zeros(())
+    here = Knot(t_init, jnp.zeros((), int), jnp.asarray(dynamics.dt, float), first, x_init)
     seen = jax.eval_shape(dynamics.at(here).observe, x, u)
     stage = given["equality"], given["inequality"]
     end = given["terminal_equality"], given["terminal_inequality"]
@@ -212,6 +275,7 @@ def assembled(
             scatter=scatter,
             horizon=horizon,
             near=near,
+            free=free,
             data=found,
             t_init=t_init,
             data_at=data if callable(data) else None,

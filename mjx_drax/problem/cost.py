@@ -47,8 +47,8 @@ def _as_partial(function: Callable[..., Any]) -> Partial:
 def _call_of(cls: type) -> Callable[..., Any]:
     """What calls objects of one class: of two classes the structures may be equal, this is not."""
 
-    def call(function: Callable[..., Any], *arguments: Any, **knot: Knot) -> Any:
-        return function(*arguments, **knot)
+    def call(function: Callable[..., Any], *arguments: Any, **more: Any) -> Any:
+        return function(*arguments, **more)
 
     return call
 
@@ -88,9 +88,14 @@ def in_float64(function: Any) -> Any:
     """The same function, none of whose constants JAX has seen in float32."""
     if function is None:
         return None
-    if function.func is _of_knot:
-        return Partial(_of_knot, *map(in_float64, function.args), **function.keywords)
-    return Partial(untraced(function.func), *function.args, **function.keywords)
+
+    def own(part: Any) -> Any:
+        return in_float64(part) if isinstance(part, Partial) else part
+
+    arguments = jax.tree.map(own, function.args, is_leaf=lambda part: isinstance(part, Partial))
+    ours = function.func.__module__.startswith("mjx_drax.problem.")  # wrappers, without constants
+    func = function.func if ours else untraced(function.func)
+    return Partial(func, *arguments, **function.keywords)
 
 
 @register_dataclass

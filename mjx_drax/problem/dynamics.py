@@ -11,6 +11,7 @@ quaternions) brings three, `step`, `difference` and `integrate`, and `ndx`. The 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -22,7 +23,7 @@ from jax.tree_util import Partial
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.problem import rollout
 from mjx_drax.problem.cost import at_knot, in_float64
-from mjx_drax.problem.trajectory import Knot
+from mjx_drax.problem.trajectory import Knot, Trajectory
 
 
 class Dynamics:
@@ -51,6 +52,11 @@ class Dynamics:
     @property
     def ndx(self) -> int:
         """Numbers in a difference of states."""
+        return self.nx
+
+    @property
+    def given_nx(self) -> int:
+        """Numbers in a state as a user gives it, without what the problem has added."""
         return self.nx
 
     def step(self, x: Array, u: Array) -> Array:
@@ -130,6 +136,22 @@ class Dynamics:
             states (chains, K + 1, nx) and the controls that were applied (chains, K, nu).
         """
         return rollout.replay(self, plan, u, gains, limits, knots)
+
+    def stepper(self, x: np.ndarray) -> Any:
+        """An engine of its own with states (chains, nx) to step; None: f in float64."""
+        return None
+
+    def configured(self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any]) -> None:
+        """Give every chain of a stepper its time between knots [s] and its parameters."""
+        raise NotImplementedError
+
+    def times(self, states: np.ndarray, t_init: float) -> np.ndarray:
+        """Times of x_0..x_K (K + 1, nx), (K + 1,) [s]."""
+        return t_init + float(self.dt) * np.arange(len(states))
+
+    def consistent(self, knots: Trajectory) -> Trajectory:
+        """Drawn or guessed knots, with those states that must agree with others."""
+        return knots
 
     def host_difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """`difference` of states (..., nx) on the host, in float64, (..., ndx)."""

@@ -53,11 +53,12 @@ class Problem:
         terminal: phi, called with (dynamics.observe(x, 0),).
         constraint: equality and inequality on (dynamics.observe(x, u), u) at every stage.
         terminal_constraint: the same on (dynamics.observe(x, 0),) at x_K.
-        x_init: x_0, (nx,).
+        x_init: x_0, (nx,); or what its free coordinates are counted from.
         bounds: the box that every knot must keep to.
         scatter: the box that initial knots are drawn from, uniformly.
         horizon: K, number of control knots.
         near: share of the chains that start nearer to x_init than the scatter.
+        free: the coordinates of x_0, in tangent space, that each entry of `Trajectory.start` moves.
         data: numbers for every knot, arrays (K + 1, ...); or None.
         t_init: time of x_0 [s].
         goal: what a replay must reach: a test of dynamics.observe_replayed(x_K), or None.
@@ -79,6 +80,7 @@ class Problem:
     scatter: Box
     horizon: int = field(metadata=Static)
     near: float = field(default=0.0, metadata=Static)
+    free: tuple[tuple[int, ...], ...] = field(default=(), metadata=Static)
     data: Any = None
     t_init: Any = 0.0
     goal: Callable[[Any], Any] | None = field(default=None, metadata=HostOnly)
@@ -89,14 +91,17 @@ class Problem:
     @property
     def times(self) -> np.ndarray:
         """Times of x_0..x_K, (K + 1,) [s]."""
-        return float(self.t_init) + float(self.dynamics.dt) * np.arange(self.horizon + 1)
+        start = np.zeros((self.horizon + 1, self.dynamics.nx))
+        start[:] = np.asarray(self.x_init)
+        return self.dynamics.times(start, float(self.t_init))
 
     @property
     def knots(self) -> Knot:
         """Time, number and data of knots 0..K."""
         k, dt = jnp.arange(self.horizon + 1), jnp.asarray(self.dynamics.dt, self.x_init.dtype)
         first = jnp.round(self.t_init / dt).astype(k.dtype)
-        return Knot(self.t_init + dt * k, first + k, jnp.broadcast_to(dt, k.shape), self.data)
+        steps, start = jnp.broadcast_to(dt, k.shape), jnp.tile(self.x_init, (len(k), 1))
+        return Knot(self.t_init + dt * k, first + k, steps, self.data, start)
 
     def at(self, knot: Knot) -> Problem:
         """The problem with all functions of a stage, or of the end, bound to one knot."""
@@ -153,11 +158,41 @@ class Problem:
         """Constraints at the end, [equality; inequality], (m_end,)."""
         return self.end.terminal_constraint(*self.end.seen(x))
 
+    @property
+    def start_map(self) -> Array | None:
+        """E (ndx, n0) of 0 and 1: x_0 = x_init + E `Trajectory.start`; None if x_0 is fixed."""
+        if not self.free:
+            return None
+        E = np.zeros((self.dynamics.ndx, len(self.free)))
+        for i, places in enumerate(self.free):
+            E[list(places), i] = 1.0
+        return jnp.asarray(E, self.x_init.dtype)
+
+    def start_from(self, x: Array) -> Array | None:
+        """`Trajectory.start` (n0,) of a motion that begins at x (nx,); None if x_0 is fixed."""
+        E = self.start_map
+        if E is None:
+            return None
+        return (E / jnp.sum(E, axis=0)).T @ self.dynamics.difference(x, self.x_init)
+
+    def first(self, trajectory: Trajectory) -> Array:
+        """x_0, (..., nx)."""
+        leading = trajectory.x.shape[:-2]
+        x = jnp.broadcast_to(self.x_init, (*leading, self.dynamics.nx))
+        if trajectory.start is None:
+            return x
+        E = self.start_map
+        assert E is not None  # for the type checker
+        change = jnp.asarray(trajectory.start) @ E.T
+        move = self.dynamics.integrate
+        for _ in leading:
+            move = jax.vmap(move)
+        return move(x, change)
+
     def with_start(self, trajectory: Trajectory) -> Array:
-        """x_0..x_K, (..., K + 1, nx): the states with x_init in front."""
+        """x_0..x_K, (..., K + 1, nx): the states with x_0 in front."""
         x = jnp.asarray(trajectory.x)
-        start = jnp.broadcast_to(self.x_init, (*x.shape[:-2], 1, x.shape[-1]))
-        return jnp.concatenate([start, x], axis=-2)
+        return jnp.concatenate([self.first(trajectory)[..., None, :], x], axis=-2)
 
     def stages(self, trajectory: Trajectory) -> tuple[Array, Array, Knot]:
         """x_0..x_{K-1} (K, nx), the controls (K, nu) that act on them, and their knots."""
@@ -228,8 +263,8 @@ class Problem:
     def displaced(self, trajectory: Trajectory, change: Trajectory) -> Trajectory:
         """X + change: the knots moved along a tangent `change`, and slacks with it."""
         x = jax.vmap(self.dynamics.integrate)(trajectory.x, change.x)
-        slack = jax.tree.map(jnp.add, trajectory.slack, change.slack)
-        return Trajectory(x, trajectory.u + change.u, slack)
+        own, by = ((z.u, z.slack, z.start) for z in (trajectory, change))
+        return Trajectory(x, *jax.tree.map(jnp.add, own, by))
 
     def draw(self, key: Array) -> Trajectory:
         """Random initial knots for one chain; they need not be feasible.
@@ -243,7 +278,7 @@ class Problem:
         if self.guess is not None:
             knots = self.guess(key)
             x, u = (jnp.asarray(part, self.x_init.dtype) for part in (knots.x, knots.u))
-            return replace(knots, x=self.dynamics.valid(x), u=u)
+            return self.started(replace(knots, x=x, u=u))
         key_x, key_u = jax.random.split(key)
         box, dynamics = self.scatter, self.dynamics
         x = jax.random.uniform(key_x, (self.horizon, dynamics.nx))
@@ -255,7 +290,26 @@ class Problem:
             share = CLOSE ** jnp.maximum((power - (1.0 - self.near)) / self.near, 0.0)
             middle = 0.5 * (box.u_lower + box.u_upper)
             x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
-        return Trajectory(dynamics.valid(x), u)
+        knots = Trajectory(dynamics.valid(x), u)
+        lower, upper = box.start_lower, box.start_upper
+        if lower is not None and upper is not None:
+            share = jax.random.uniform(jax.random.fold_in(key, 3), lower.shape)
+            knots = replace(knots, start=lower + share * (upper - lower))
+        return dynamics.consistent(knots)
+
+    def started(self, knots: Trajectory) -> Trajectory:
+        """Given knots as states of the dynamics, with the x_0 next to x_init where it is free.
+
+        Further states of the dynamics may be missing.
+        """
+        short = self.dynamics.nx - knots.x.shape[-1]
+        pad = [(0, 0)] * (knots.x.ndim - 1)
+        knots = replace(knots, x=self.dynamics.valid(jnp.pad(knots.x, [*pad, (0, short)])))
+        if self.free and knots.start is None:
+            nearest = jnp.clip(0.0, self.bounds.start_lower, self.bounds.start_upper)
+            shape = (*knots.x.shape[:-2], len(self.free))
+            knots = replace(knots, start=jnp.broadcast_to(nearest, shape))
+        return self.dynamics.consistent(knots) if short else knots
 
     def replay(
         self, plan: ArrayLike, u: ArrayLike, gains: ArrayLike
@@ -364,7 +418,10 @@ class Problem:
         Raises:
             DraxError: it does not fit.
         """
-        return checked(replace(self, x_init=vector("x_init", x_init)))
+        x = vector("x_init", x_init)
+        if len(x) == self.dynamics.given_nx:
+            x = jnp.concatenate([x, self.x_init[len(x) :]])
+        return checked(replace(self, x_init=x))
 
 
 def checked(problem: Problem) -> Problem:

@@ -33,6 +33,32 @@ def replay(
         return np.asarray(ran[0]), np.asarray(ran[1])
 
 
+def replay_by(
+    advance: Callable[[int, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    difference: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    plan: np.ndarray,
+    u: np.ndarray,
+    gains: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Dynamics.replay` by an engine on the host.
+
+    Args:
+        advance: k, states (chains, nx) and controls (chains, nu) to the next states and to the
+            controls that were applied, NaN where a chain has diverged.
+        difference: `Dynamics.host_difference`.
+        plan, u, gains, limits: as of `Dynamics.replay`.
+    """
+    lower, upper = (np.broadcast_to(side, u.shape[1:]) for side in limits)
+    states, applied = np.full(plan.shape, np.nan), np.full(u.shape, np.nan)
+    states[:, 0] = plan[:, 0]
+    for k in range(u.shape[1]):
+        off = difference(states[:, k], plan[:, k])
+        wanted = np.clip(u[:, k] + np.einsum("cij,cj->ci", gains[:, k], off), lower[k], upper[k])
+        states[:, k + 1], applied[:, k] = advance(k, states[:, k], wanted)
+    return states, applied
+
+
 def apply(dynamics: Any, name: str, *arrays: np.ndarray) -> np.ndarray:
     """A method of the dynamics that works on single states, for arrays (..., n) of them."""
     leading = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))

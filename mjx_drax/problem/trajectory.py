@@ -29,12 +29,20 @@ class Knot:
         index: k, counted from time 0.
         dt: time from here to the next knot [s].
         data: the user's data for the knot: row k of every array in `data` of the problem.
+        x_init: x_0, (nx,).
+        parameters: what was chosen for the whole motion, by name; None without.
+        rate: (u_k - u_{k-1}) / dt, (nu,), where rates are asked for; None at the end.
+        jerk: the same of the rate.
     """
 
     time: Array
     index: Array
     dt: Array
     data: Any = None
+    x_init: Any = None
+    parameters: Any = None
+    rate: Any = None
+    jerk: Any = None
 
     def at(self, which: Any) -> Knot:
         """One knot of several, or a slice of them."""
@@ -57,12 +65,14 @@ class Trajectory:
     """Knot points: states x_1..x_K (..., K, nx) and controls u_0..u_{K-1} (..., K, nu).
 
     What a chain carries also has the slack variables s >= 0 of inequalities; a trajectory that a
-    user gives does not.
+    user gives does not. Where x_0 is free, `start` (n0,) is by how much its free coordinates differ
+    from x_init.
     """
 
     x: Array
     u: Array
     slack: Stagewise | None = None
+    start: Array | None = None
 
 
 @register_dataclass
@@ -89,12 +99,17 @@ class Values:
 @register_dataclass
 @dataclass(frozen=True)
 class Box:
-    """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free."""
+    """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free.
+
+    Where x_0 is free, also those of `Trajectory.start`, (n0,).
+    """
 
     x_lower: Array
     x_upper: Array
     u_lower: Array
     u_upper: Array
+    start_lower: Array | None = None
+    start_upper: Array | None = None
 
     def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
         """The lower and the upper end for every knot of a trajectory, as two trajectories."""
@@ -102,13 +117,15 @@ class Box:
         zeros = jax.tree.map(jnp.zeros_like, trajectory.slack)
         infinite = jax.tree.map(lambda s: jnp.full_like(s, jnp.inf), trajectory.slack)
 
-        def side(of_x: Array, of_u: Array, of_slack: Stagewise | None) -> Trajectory:
-            return Trajectory(
-                jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape), of_slack
-            )
+        def side(
+            of_x: Array, of_u: Array, of_slack: Stagewise | None, of_start: Array | None
+        ) -> Trajectory:
+            start = None if trajectory.start is None else of_start
+            whole = jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape)
+            return Trajectory(*whole, of_slack, start)
 
-        lower = side(self.x_lower, self.u_lower, zeros)
-        upper = side(self.x_upper, self.u_upper, infinite)
+        lower = side(self.x_lower, self.u_lower, zeros, self.start_lower)
+        upper = side(self.x_upper, self.u_upper, infinite, self.start_upper)
         return lower, upper
 
     def violation(self, trajectory: Trajectory) -> Array:
@@ -120,7 +137,8 @@ class Box:
             lower,
             upper,
         )
-        return jnp.maximum(out.x, out.u)
+        largest = jnp.maximum(out.x, out.u)
+        return largest if out.start is None else jnp.maximum(largest, out.start)
 
 
 def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:

@@ -520,13 +520,13 @@ class Search:
 
     def _rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
         """Every chain's knots replaced by a rollout of its controls."""
-        problem, knots = self.family.problem, chains.state.trajectory
-        rows = self.family.rows(self.indices, self.chains)
+        knots = chains.state.trajectory
         gains, dtype = with_feedback * np.asarray(chains.state.gains), knots.x.dtype
-        start = np.broadcast_to(rows.x_init, (len(knots.x), problem.dynamics.nx))
+        start = self.family.starts(self.indices, knots)
         plan = np.concatenate([start[:, None], knots.x], axis=1)
         states, controls = self.family.replay(self.indices, plan, np.asarray(knots.u), gains)
-        rolled = Trajectory(jnp.asarray(states[:, 1:], dtype), jnp.asarray(controls, dtype))
+        x, u = (jnp.asarray(a, dtype) for a in (states[:, 1:], controls))
+        rolled = Trajectory(x, u, start=knots.start)
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
         return self._whole(Chains(state, info, np.full(len(knots.x), done)))
@@ -579,7 +579,7 @@ class Search:
 
         def state() -> State:
             x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))
-            return begin(own, shared, Trajectory(x, u), jax.random.key(0))
+            return begin(own, shared, problem.started(Trajectory(x, u)), jax.random.key(0))
 
         def size(tree: Any) -> int:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))

@@ -18,6 +18,7 @@ from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import plain
+from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import Question, partition
 
 
@@ -160,6 +161,16 @@ class Family:
             return self.problem
         which = np.repeat(indices, chains)
         return self._changed(lambda leaf: leaf[which])
+
+    def starts(self, indices: np.ndarray, knots: Trajectory) -> np.ndarray:
+        """x_0 of knots (rows, K, ...), as many for each of those problems, (rows, nx)."""
+        rows = self.rows(indices, len(knots.x) // len(indices))
+        x = jnp.broadcast_to(rows.x_init, (len(knots.x), rows.dynamics.nx))
+        E = rows.start_map
+        if E is None or knots.start is None:
+            return np.asarray(x)
+        with self.problem.arithmetic():
+            return np.asarray(jax.vmap(self.at(0).dynamics.integrate)(x, knots.start @ E.T))
 
     def question(
         self,

@@ -34,6 +34,9 @@ def initial_knots(
             raise DraxError(
                 f"guess.{label} is {shown(value)}: give numbers of shape ({K}, {size})."
             ) from error
+        short = problem.dynamics.given_nx if label == "x" else size
+        if array.shape[-1:] == (short,):
+            size = short
         if array.shape not in ((K, size), (chains, K, size)):
             raise DraxError(
                 f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
@@ -42,7 +45,7 @@ def initial_knots(
         if not np.isfinite(array).all():
             raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
         knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
-    return Trajectory(problem.dynamics.valid(knots[0]), knots[1])
+    return problem.started(Trajectory(knots[0], knots[1]))
 
 
 _draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))

@@ -19,6 +19,7 @@ from mjx_drax.base.errors import require_whole
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.tracing import require_functions
+from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Search
@@ -231,8 +232,8 @@ def _certified(
     x, u, gains = (
         np.asarray(a)[rows] for a in (state.trajectory.x, state.trajectory.u, state.gains)
     )
-    start = np.broadcast_to(family.problem.x_init, (family.count, x.shape[-1]))
-    plan = np.concatenate([start[:, None], x], axis=1)
+    chosen: Trajectory = jax.tree.map(lambda a: np.asarray(a)[rows], state.trajectory)
+    plan = np.concatenate([family.starts(np.arange(family.count), chosen)[:, None], x], axis=1)
     open_loop, feedback = both_ways(family, plan, u, gains, tolerances)
     return BatchSolution(
         family=family,

@@ -52,7 +52,7 @@ def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
     with complete(path, (".csv",)) as partial, partial.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(["time", *state_names(dynamics), *control_names(dynamics)])
-        for k, (time, x) in enumerate(zip(solution.problem.times, states, strict=True)):
+        for k, (time, x) in enumerate(zip(solution.times, states, strict=True)):
             u = controls[k] if k < len(controls) else [""] * dynamics.nu
             table.writerow([f"{time:.9g}", *x, *u])
     return file_path(path)
@@ -108,7 +108,7 @@ def _keys(solution: Solution, model: mujoco.MjModel) -> Iterator[str]:
     """One element a knot; the last one keeps the last control."""
     states, controls = solution.replayed
     ends = [model.nq, model.nq + model.nv]
-    for k, (time, x) in enumerate(zip(solution.problem.times, states, strict=True)):
+    for k, (time, x) in enumerate(zip(solution.times, states, strict=True)):
         if not np.isfinite(x).all():
             break
         parts = dict(zip(("qpos", "qvel", "act"), np.split(x, ends), strict=True))
@@ -166,7 +166,7 @@ def save_dataset(
             group.attrs["seed"], group.attrs["dt"] = solution.seed, float(problem.dynamics.dt)
             group.attrs["state_names"] = state_names(problem.dynamics)
             group.attrs["control_names"] = control_names(problem.dynamics)
-            for name, values in {"times": problem.times, **table}.items():
+            for name, values in {"times": solution.times, **table}.items():
                 group.create_dataset(name, data=values)
     return file_path(path)
 

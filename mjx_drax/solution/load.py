@@ -229,7 +229,8 @@ def _stagewise(label: str, arrays: Arrays) -> Any:
 
 def _trajectory(label: str, arrays: Arrays) -> Trajectory:
     slack = _stagewise(f"{label}.slack", arrays) if f"{label}.slack.stage" in arrays else None
-    return Trajectory(arrays[f"{label}.x"], arrays[f"{label}.u"], slack)  # type: ignore[arg-type]
+    start: Any = arrays.get(f"{label}.start")
+    return Trajectory(arrays[f"{label}.x"], arrays[f"{label}.u"], slack, start)  # type: ignore[arg-type]
 
 
 def _box(label: str, arrays: Arrays) -> Box:

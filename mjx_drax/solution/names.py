@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.extended import Extended
 
 _POSITIONS = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
@@ -23,8 +26,11 @@ def state_names(dynamics: Dynamics) -> list[str]:
 
     For a model qpos_JOINT, qvel_JOINT and act_ACTUATOR, in MuJoCo's units; joints with several
     coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise x0,
-    x1, ...
+    x1, ... Behind them are the names of what the problem leaves open: start_NAME, parameters, step
+    or step_PHASE, and before_NAME of the last controls.
     """
+    if isinstance(dynamics, Extended):
+        return [*state_names(dynamics.inner), *_further_names(dynamics)]
     model = mujoco_model(dynamics)
     if model is None:
         return [f"x{i}" for i in range(dynamics.nx)]
@@ -33,6 +39,19 @@ def state_names(dynamics: Dynamics) -> list[str]:
         *_joint_names(model, "qvel", _VELOCITIES),
         *_activation_names(model),
     ]
+
+
+def _further_names(dynamics: Extended) -> list[str]:
+    inner, own = state_names(dynamics.inner), []
+    vector = dynamics.inner.nx == dynamics.inner.ndx
+    own += [f"start_{inner[i] if vector else i}" for i in dynamics.free]
+    for name, shape in dynamics.shapes:
+        places = np.ndindex(*shape)
+        own += ["_".join([name, *map(str, place)]) for place in places]
+    phases = len(dynamics.phases)
+    own += ["step"] if phases == 1 else [f"step_{i}" for i in range(phases)]
+    controls = control_names(dynamics.inner)
+    return own + [f"before{i or ''}_{u}" for i in range(dynamics.order) for u in controls]
 
 
 def control_names(dynamics: Dynamics) -> list[str]:

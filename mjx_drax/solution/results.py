@@ -23,6 +23,7 @@ from mjx_drax.base.errors import DraxError, require_positive
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Multipliers
 from mjx_drax.polish.interior_point import Progress as PolishProgress
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE
@@ -159,8 +160,8 @@ class Results:
     @cached_property
     def plans(self) -> np.ndarray:
         """Planned states x_0..x_K of every chain, (chains, K + 1, nx)."""
-        x, start = self.trajectories.x, np.asarray(self.problem.x_init)
-        return np.concatenate([np.broadcast_to(start, (len(x), 1, len(start))), x], axis=1)
+        with self.problem.arithmetic():
+            return np.asarray(self.problem.with_start(self.trajectories))
 
     @cached_property
     def feasible(self) -> np.ndarray:
@@ -252,6 +253,21 @@ class Results:
     def best(self) -> Trajectory:
         """The best chain's knots x_1..x_K (K, nx) and u_0..u_{K-1} (K, nu)."""
         return jax.tree.map(lambda a: a[self.best_chain], self.trajectories)
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """Times of x_0..x_K of the best chain, (K + 1,) [s]."""
+        problem = self.problem
+        return problem.dynamics.times(self.plans[self.best_chain], float(problem.t_init))
+
+    @cached_property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """The parameters that the best chain has chosen, by name; none if there are none."""
+        dynamics = self.problem.dynamics
+        if not isinstance(dynamics, Extended):
+            return {}
+        chosen = dynamics.extras(self.plans[self.best_chain, 0]).p
+        return {name: np.asarray(value) for name, value in dynamics.parameters(chosen).items()}
 
     @cached_property
     def certificate(self) -> Certificate:

@@ -117,7 +117,7 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
     replayed_states, replayed_controls = solution.replayed
     return {
         **_whole(solution),
-        "times": solution.problem.times,
+        "times": solution.times,
         "states": solution.plans[best],
         "controls": np.asarray(solution.best.u),
         "multipliers": solution.multipliers.dynamics[best],

@@ -327,7 +327,10 @@ def _measured(
 
     def of_motion(own: Problem, motion: tuple[Array, Array], off: Array, extent: Any) -> Any:
         states, u = motion
-        problem = replace(joined(shared, own), x_init=states[0])
+        problem = joined(shared, own)
+        start = problem.start_from(states[0])
+        if start is None:
+            problem = replace(problem, x_init=states[0])
         least = (STILL * width for width in scatter_widths(problem))
         E = tuple(map(jnp.maximum, extent, least))
         worst = []
@@ -336,7 +339,7 @@ def _measured(
         ):
             allowed = jnp.where(jnp.isnan(number), relative * scale, number)
             worst.append(_largest(size, jnp.broadcast_to(allowed, size.shape), first))
-        cost = problem.cost(Trajectory(states[1:], u))
+        cost = problem.cost(Trajectory(states[1:], u, start=start))
         return cost, tuple(map(jnp.stack, zip(*worst, strict=True)))
 
     found: Any = jax.vmap(of_motion, out_axes=(0, 1))(own, motion, off, extent)

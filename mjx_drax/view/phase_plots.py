@@ -105,7 +105,7 @@ def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
         DraxError: the path cannot be written.
     """
     values = np.nan_to_num(solution.multipliers.dynamics[solution.best_chain])
-    times, names = solution.problem.times, tangent_labels(solution.problem.dynamics)
+    times, names = solution.times, tangent_labels(solution.problem.dynamics)
     largest = np.abs(values).max(axis=0)
     inches = (7.0, 0.24 * len(names) + 1.7)
     figure = Figure(inches, DPI, layout="constrained", facecolor="white")

@@ -69,7 +69,7 @@ def plot_solution(
     Raises:
         DraxError: the path cannot be written.
     """
-    times, mode = solution.problem.times, solution.replay_mode
+    times, mode = solution.times, solution.replay_mode
     panels: list[Panel] = []
     if draw is not None:
         panels.append(partial(_draw_scene, solution=solution, draw=draw))
@@ -115,7 +115,7 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
         ]
         figure = panel_figure(panels, 3, (3.0, 3.2))
     else:
-        shown, times = found[: len(CURVES)], solution.problem.times
+        shown, times = found[: len(CURVES)], solution.times
         kinds = state_groups(solution.problem.dynamics).values()
         labels = sorted(pair for labels in kinds for pair in labels.items())
         panels = [

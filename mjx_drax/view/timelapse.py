@@ -54,7 +54,7 @@ def render_timelapse(
             f"{solution.problem.name} has no model to show: make the problem with from_mjcf."
         )
     qpos = finite(solution.replayed[0])[:, : model.nq]
-    times = solution.problem.times[: len(qpos)]
+    times = solution.times[: len(qpos)]
     seen_by = camera_for(model, qpos, FREE if camera is None else camera, width / height)
     scene = Scene(model, seen_by)
     scene.begin(qpos[-1])

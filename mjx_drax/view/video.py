@@ -65,7 +65,7 @@ def render(
     """
     check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
     states = finite(solution.replayed[0])
-    times, overlay = solution.problem.times[: len(states)], outcome_lines(solution)
+    times, overlay = solution.times[: len(states)], outcome_lines(solution)
     model = mujoco_model(solution.problem.dynamics)
     if model is not None:
         qpos, look = states[:, : model.nq], {"size": size, "camera": camera, "speed": speed}

@@ -12,8 +12,9 @@ from jax.tree_util import Partial
 
 from mjx_drax import Constant, GaussNewton, Langevin, LogBarrier, Trajectory, from_function, solve
 from mjx_drax.method.bounds import Projection
+from mjx_drax.method.descent import augmented_lagrangian
 from mjx_drax.method.gauss_newton import eliminate, slack_noise, slack_step
-from mjx_drax.method.model import Multipliers, augmented_lagrangian, expand
+from mjx_drax.method.model import Multipliers, expand
 from mjx_drax.method.schedules import Weights
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.trajectory import Stagewise

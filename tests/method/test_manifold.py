@@ -13,7 +13,8 @@ import pytest
 
 from mjx_drax import LBFGS, Diagonal, DraxError, GaussNewton, Identity, Langevin, from_mjcf, solve
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.method.model import augmented_lagrangian, expand
+from mjx_drax.method.descent import augmented_lagrangian
+from mjx_drax.method.model import expand
 from mjx_drax.method.schedules import Weights
 from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.joints import Joints

@@ -90,7 +90,7 @@ def test_noise_covariance_is_exactly_the_inverse_of_M(mu):
 
     def noise(numbers):
         drawn = White(numbers[: K * NU].reshape(K, NU), numbers[K * NU :].reshape(K, NDX))
-        factors = factorize(model, cost, multipliers, mu)
+        _, factors = factorize(model, cost, multipliers, mu)
         step = solve_and_sample(model, factors, multipliers, mu, drawn)
         return jnp.concatenate([step.nx.ravel(), step.nu.ravel()])
 

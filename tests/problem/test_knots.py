@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import NAN, point, robot
+from builders import DT, NAN, K, double_integrator, matrices, point, robot
 
 from mjx_drax import (
     MPC,
@@ -19,31 +19,11 @@ from mjx_drax import (
     Terms,
     at_time,
     between,
-    from_function,
     solve,
     solve_batch,
 )
 
-DT, K = 0.1, 20
 TIMES = DT * np.arange(K + 1)
-
-
-def double_integrator(f=None, **changes):
-    """x = [p, v] pushed by u."""
-    given = {"x_init": [0.0, 0.0], "nu": 1, "dt": DT, "horizon": K * DT, "name": "cart"}
-    return from_function(f or (lambda x, u: x + DT * jnp.stack([x[1], u[0]])), **given | changes)
-
-
-def matrices(push=None):
-    """G and c of x_1..x_K = G u + c for the double integrator with an acceleration push (K,)."""
-    A, B = np.array([[1, DT], [0, 1.0]]), np.array([0, DT])
-    G, c = np.zeros((K, 2, K)), np.zeros((K, 2))
-    push = np.zeros(K) if push is None else push
-    for k in range(K):
-        before = (G[k - 1], c[k - 1]) if k else (np.zeros((2, K)), np.zeros(2))
-        G[k], c[k] = A @ before[0], A @ before[1] + B * push[k]
-        G[k, :, k] += B
-    return G, c
 
 
 def tracking_optimum(reference):

@@ -1,0 +1,338 @@
+"""Free x_0, parameters, free durations and rates of controls, against closed forms."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from builders import DT, K, arm, double_integrator, matrices, robot
+
+from mjx_drax import (
+    MPC,
+    DraxError,
+    Solution,
+    Trajectory,
+    from_function,
+    from_mjcf,
+    solve,
+    solve_batch,
+)
+from mjx_drax.solution.names import state_names
+
+GOAL = np.array([1.0, 0.0])
+
+
+def pushed(x, u, knot):
+    """A unit mass pushed by u, held over the step."""
+    h = knot.dt
+    return jnp.stack([x[0] + h * x[1] + 0.5 * h * h * u[0], x[1] + h * u[0]])
+
+
+def fastest(**changes):
+    """The double integrator from rest to rest in the least time, |u| <= 1."""
+    given = {
+        "f": pushed,
+        "x_init": np.zeros(2),
+        "nu": 1,
+        "horizon": (0.5, 5.0),
+        "knots": 20,
+        "running_cost": lambda x, u, knot: knot.dt,
+        "terminal_equality": lambda x: x - GOAL,
+        "u_bounds": (-1.0, 1.0),
+        "name": "fastest",
+    }
+    return from_function(**given | changes)
+
+
+def test_the_least_time_of_a_double_integrator(tmp_path):
+    problem = fastest()
+    found = solve(problem, chains=4)
+    assert found.optimal
+    assert found.certified
+    assert found.cost.min() == pytest.approx(2.0, abs=1e-4)  # 2 sqrt(d / a)
+    assert found.times[-1] == pytest.approx(2.0, abs=1e-4)
+    np.testing.assert_allclose(found.best.u[:, 0], np.sign(9.5 - np.arange(20)), atol=1e-2)
+    assert state_names(problem.dynamics) == ["x0", "x1", "step"]
+    found.save(tmp_path)
+    loaded = Solution.load(tmp_path, problem)
+    np.testing.assert_array_equal(loaded.times, found.times)
+    np.testing.assert_array_equal(loaded.best.start, found.best.start)
+    again = found.certify()
+    np.testing.assert_array_equal(again.open_loop.states, found.open_loop.states)
+
+
+def test_least_times_of_many_distances():
+    problem = fastest(
+        data={"d": np.ones(21)},
+        terminal_equality=lambda x, knot: x - jnp.stack([knot.data["d"], 0.0]),
+    )
+    distances = jnp.array([0.5, 1.0, 2.0])
+    found = solve_batch(
+        lambda d: replace(problem, data={"d": jnp.full(21, d)}), distances, chains=2
+    )
+    np.testing.assert_allclose(found.cost, 2 * np.sqrt(distances), atol=1e-3)
+
+
+def test_two_phases_each_take_their_least_time():
+    def there(x, u, knot):
+        return jnp.where(knot.index == 12, x - GOAL, 0.0)
+
+    problem = fastest(
+        horizon=[(0.5, 5.0), (0.5, 5.0)],
+        knots=[12, 16],
+        equality=there,
+        terminal_equality=lambda x: x,
+    )
+    found = solve(problem, chains=4)
+    assert found.optimal
+    assert found.certified
+    np.testing.assert_allclose(found.times[[12, -1]], [2.0, 4.0], atol=1e-3)
+
+
+def test_a_free_start_is_chosen_within_its_bounds():
+    problem = double_integrator(
+        running_residual=lambda x, u: u,
+        terminal_equality=lambda x: x - GOAL,
+        x_init_bounds=([-0.5, -2.0], [0.2, 2.0]),
+    )
+    found = solve(problem, chains=4)
+    G, _ = matrices()
+    A = np.array([[1, DT], [0, 1.0]])
+    free = np.linalg.matrix_power(A, K)  # x_K = A^K x_0 + G u; x_0 = [0.2, v]
+    rows = np.concatenate([np.concatenate([G[-1], free[:, 1:]], axis=1)])
+    right = GOAL - free[:, 0] * 0.2
+    weights = np.concatenate([np.ones(K), [1e-9]])  # v costs nothing
+    solution = np.linalg.lstsq(rows / np.sqrt(weights), right, rcond=None)[0] / np.sqrt(weights)
+    np.testing.assert_allclose(found.plans[found.best_chain, 0], [0.2, solution[-1]], atol=2e-3)
+    np.testing.assert_allclose(found.best.u[:, 0], solution[:-1], atol=2e-3)
+    assert found.optimal
+    assert found.certified
+
+
+def test_a_periodic_motion_is_the_steady_response():
+    """x'' = -x - 0.1 x' + cos 2t + u: without u, x = Re (e^{2it} / (1 - 4 + 0.2i))."""
+
+    def f(x, u, knot):
+        h, t = knot.dt, knot.time
+
+        def rate(x, t):
+            return jnp.stack([x[1], -x[0] - 0.1 * x[1] + jnp.cos(2 * t) + u[0]])
+
+        a = rate(x, t)
+        b = rate(x + h / 2 * a, t + h / 2)
+        c = rate(x + h / 2 * b, t + h / 2)
+        d = rate(x + h * c, t + h)
+        return x + h / 6 * (a + 2 * b + 2 * c + d)
+
+    problem = from_function(
+        f,
+        x_init=np.zeros(2),
+        x_init_bounds=(-5.0, 5.0),
+        nu=1,
+        horizon=np.pi,
+        knots=40,
+        running_residual=lambda x, u: u,
+        terminal_equality=lambda x, knot: x - knot.x_init,
+    )
+    found = solve(problem, chains=2, precision=64)
+    response = 1 / (1 - 4 + 0.2j)
+    expected = [response.real, -2 * response.imag]
+    np.testing.assert_allclose(found.plans[found.best_chain, 0, :2], expected, atol=1e-4)
+    assert found.optimal
+    assert found.certified
+
+
+def test_a_parameter_is_chosen_once():
+    problem = from_function(
+        lambda x, u, knot: x + DT * knot.parameters["speed"],
+        x_init=np.zeros(2),
+        nu=1,
+        horizon=K * DT,
+        dt=DT,
+        running_residual=lambda x, u: u,
+        terminal_residual=lambda x, knot: jnp.concatenate([x - 1.0, knot.parameters["speed"]]),
+        parameters={"speed": (-2 * np.ones(2), 2 * np.ones(2)), "unused": (0.0, 1.0)},
+    )
+    found = solve(problem, chains=4)
+    T = K * DT  # 1/2 |T p - 1|^2 + 1/2 |p|^2
+    np.testing.assert_allclose(found.parameters["speed"], T / (T * T + 1), atol=1e-3)
+    assert found.parameters["unused"].shape == ()
+    assert found.certified
+    names = state_names(problem.dynamics)
+    assert names == ["x0", "x1", "speed_0", "speed_1", "unused"]
+
+
+def test_the_c_engine_replays_the_changed_model_at_its_own_step():
+    problem = robot(
+        horizon=(0.05, 0.2),
+        knots=10,
+        dt=0.01,
+        parameters={"mass": (0.5, 3.0)},
+        model_numbers=lambda model, p: {"body_mass": model.body_mass.at[1].set(p["mass"])},
+    )
+    mass, h = np.array([0.7, 2.5]), np.array([0.004, 0.02])
+    plan = np.tile(np.asarray(problem.x_init, float), (2, 11, 1))
+    plan[:, :, 2], plan[:, :, 3] = mass[:, None], h[:, None]
+    u = 0.3 * np.ones((2, 10, 1))
+    states, _ = problem.replay(plan, u, np.zeros((2, 10, 1, 4)))
+    for chain in range(2):
+        model = mujoco.MjModel.from_xml_string(arm())
+        model.body_mass[1], model.opt.timestep = mass[chain], h[chain]
+        data = mujoco.MjData(model)
+        data.qpos[:] = plan[chain, 0, :1]
+        for _ in range(10):
+            data.ctrl[:] = 0.3
+            mujoco.mj_step(model, data)
+        np.testing.assert_allclose(states[chain, -1, :2], [data.qpos[0], data.qvel[0]], rtol=1e-9)
+    start = problem.start_from(jnp.asarray(plan[0, 0], problem.x_init.dtype))
+    knots = Trajectory(jnp.asarray(states[0, 1:]), jnp.asarray(u[0]), start=start)
+    assert np.abs(problem.defects(knots)).max() < 1e-5  # f is that of the changed model, too
+
+
+def test_rates_cost_and_are_bounded():
+    problem = double_integrator(
+        running_residual=lambda x, u, knot: knot.rate,
+        terminal_equality=lambda x: x - GOAL,
+        u_init=[0.5],
+        rates=1,
+    )
+    found = solve(problem, chains=2)
+    G, _ = matrices()
+    D = (np.eye(K) - np.eye(K, k=-1)) / DT
+    first = np.zeros(K)
+    first[0] = 0.5 / DT  # rate = D u - first
+    system = np.block([[D.T @ D, G[-1].T], [G[-1], np.zeros((2, 2))]])
+    expected = np.linalg.solve(system, np.concatenate([D.T @ first, GOAL]))[:K]
+    np.testing.assert_allclose(found.best.u[:, 0], expected, atol=5e-3)
+    assert found.optimal
+    assert found.certified
+    limited = double_integrator(
+        running_residual=lambda x, u: u,
+        terminal_equality=lambda x: x - GOAL,
+        u_init=[0.0],
+        rate_bounds=(-2.0, 4.0),
+    )
+    found = solve(limited, chains=2)
+    rate = np.diff(found.best.u[:, 0], prepend=0.0) / DT
+    assert found.certified
+    assert rate.max() == pytest.approx(4.0, abs=0.02)
+    assert rate.min() > -2.02
+
+
+def test_jerk_is_the_rate_of_the_rate():
+    problem = double_integrator(
+        running_residual=lambda x, u, knot: jnp.concatenate([knot.rate, knot.jerk]),
+        rates=2,
+        terminal_residual=lambda x: x,
+    )
+    u = np.random.default_rng(0).normal(size=(K, 1))
+    knots = problem.started(Trajectory(jnp.zeros((K, 2)), jnp.asarray(u)))
+    rate = np.concatenate([[0.0], np.diff(u[:, 0]) / DT])
+    jerk = np.concatenate([[0.0, 0.0], np.diff(rate[1:]) / DT])
+    costs = np.asarray(problem.costs(knots))[:-1]
+    np.testing.assert_allclose(costs, 0.5 * (rate**2 + jerk**2), rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_brachistochrone_and_the_fastest_swing_up():
+    def slide(x, u, knot):
+        h = knot.dt
+
+        def rate(x):
+            sine, cosine = jnp.sin(u[0]), jnp.cos(u[0])
+            return jnp.stack([x[2] * sine, x[2] * cosine, 9.81 * cosine])
+
+        a = rate(x)
+        b = rate(x + h / 2 * a)
+        c = rate(x + h / 2 * b)
+        d = rate(x + h * c)
+        return x + h / 6 * (a + 2 * b + 2 * c + d)
+
+    found = solve(
+        fastest(
+            f=slide,
+            x_init=np.zeros(3),
+            horizon=(0.1, 5.0),
+            knots=100,
+            terminal_equality=lambda x: x[:2] - np.array([10.0, 5.0]),
+            u_bounds=(-0.5, 3.2),
+        ),
+        chains=8,
+    )
+    assert found.certified
+    assert found.cost.min() == pytest.approx(1.8012955, rel=1e-3)  # the cycloid's
+
+    cart = """
+    <mujoco><option timestep="0.01"><flag contact="disable"/></option><worldbody>
+      <body><joint type="slide" axis="1 0 0" range="-2 2" limited="true"/>
+        <geom type="box" size=".1 .1 .05" mass="1"/>
+        <body><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02"
+          mass=".2"/></body></body></worldbody>
+      <actuator><motor joint="slide" ctrlrange="-10 10" ctrllimited="true"/></actuator></mujoco>
+    """.replace('<joint type="slide"', '<joint name="slide" type="slide"')
+    upright = np.array([0.0, np.pi, 0.0, 0.0])
+    problem = from_mjcf(
+        cart,
+        horizon=(0.5, 4.0),
+        knots=60,
+        dt=0.02,
+        running_cost=lambda data, u, knot: knot.dt * (1 + 1e-4 * u[0] ** 2),
+        terminal_equality=lambda data: jnp.concatenate([data.qpos, data.qvel]) - upright,
+        goal=lambda data: abs(data.qpos[1] - np.pi) < 0.05,
+    )
+    found = solve(problem, chains=16)
+    assert found.certified
+    assert found.times[-1] < 1.3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"horizon": (2.0, 1.0)}, "0 < least < most"),
+        ({"horizon": (1.0, 2.0), "knots": None}, "knots"),
+        ({"horizon": [(1.0, 2.0), (1.0, 2.0)], "knots": [3]}, "one for each phase|for phases"),
+        ({"f": lambda x, u: x}, "f has no parameter knot"),
+        ({"horizon": 1.0, "knots": None}, "give one of the two"),
+        ({"parameters": {"m": (1.0, 1.0)}}, "the parameter 'm' is"),
+        ({"parameters": [1.0]}, "give {name:"),
+        ({"x_init_bounds": (1.0, 2.0)}, "lies outside of x_init_bounds"),
+        ({"x_init_bounds": (np.zeros(3), np.ones(3))}, "x_init_bounds are"),
+        ({"rates": 3}, "rates is 3"),
+        ({"rate_bounds": (1.0, -1.0)}, "rate_bounds are"),
+        ({"u_init": [0.0]}, "nothing reads a rate"),
+        ({"rates": 1, "u_init": [0.0, 1.0]}, "u_init has shape"),
+    ],
+)
+def test_bad_choices_are_named(changes, message):
+    with pytest.raises(DraxError, match=message):
+        fastest(**changes)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        (lambda model, p: {"mass": p["m"]}, "no such field"),
+        (lambda model, p: {"body_mass": p["m"]}, r"the model has shape"),
+        (lambda model, p: p["n"], "model_numbers failed"),
+    ],
+)
+def test_bad_numbers_of_a_model_are_named(numbers, message):
+    with pytest.raises(DraxError, match=message):
+        robot(parameters={"m": (1.0, 2.0)}, model_numbers=numbers)
+
+
+def test_policies_refuse_what_is_open():
+    with pytest.raises(DraxError, match="MPC starts where the robot is"):
+        MPC(fastest())
+
+
+def test_draws_agree_with_what_is_chosen():
+    problem = fastest(parameters={"m": (1.0, 2.0)}, rates=1)
+    knots = problem.draw(jax.random.key(0))
+    states = np.asarray(problem.with_start(knots))
+    extras = problem.dynamics.extras(states)
+    assert np.ptp(extras.p) == np.ptp(extras.h) == 0.0
+    assert 1.0 < extras.p[0, 0] < 2.0
+    np.testing.assert_array_equal(extras.v[1:, 0], knots.u[:, 0])
