@@ -40,6 +40,7 @@ from mjx_drax.search.iterate import (
     Question,
     begin,
     chain_keys,
+    evaluate,
     iterate,
     joined,
     noise_at,
@@ -49,6 +50,7 @@ from mjx_drax.search.iterate import (
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
+from mjx_drax.search.warm import Warm, warmed
 
 REPORT_EVERY = 20
 """Iterations between two reports, records of the history, and chances to interrupt; a hundredth
@@ -164,7 +166,8 @@ class Search:
         settings: with a value for everything.
         size: problems in a chunk.
         mesh: the devices, or None for one.
-        guess: initial knots of a single problem.
+        guess: initial knots of a single problem, or the answer of another one to start from. What
+            is better in it than what is found is kept.
         checkpoint: where to write.
         recorder: of a single problem's knots.
         progress: called with (iterations done, of how many, diagnostics) for a single problem.
@@ -177,7 +180,7 @@ class Search:
     settings: Restarts
     size: int = 1
     mesh: Mesh | None = None
-    guess: Trajectory | None = None
+    guess: Trajectory | Warm | None = None
     checkpoint: Checkpoint | None = None
     recorder: Recorder | None = None
     progress: Progress | None = None
@@ -219,6 +222,8 @@ class Search:
             self._save(ended, now=True)
         found = self._merged() if self.stage.begun else self.stage.kept
         assert found is not None
+        if self.guess is not None:
+            found = self._no_worse(found)
         stage, solve_time = self.stage, time.perf_counter() - self.clock
         records, began = list(stage.records), list(stage.began)
         return Found(found, records, began, first, compile_time, solve_time)
@@ -250,7 +255,7 @@ class Search:
             flow = self.settings.first(1.0)
             require_sound(flow, one, mine, with_f=not family.problem.dynamics.checked)
         self._settle(0, indices, scale)
-        state = begin(self.question[1], self.question[0], knots, keys)
+        state = self._begun(0, knots, keys)
         zeros: Any = np.zeros(rows, knots.u.dtype)
         info = Info(zeros, zeros, zeros, zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
@@ -262,6 +267,29 @@ class Search:
         records = ((0, info),)
         self.stage = Stage(0, scale, everyone, 0, True, owners, kept, now, ones, 0, 0, records)
         self._measure()
+
+    def _begun(self, attempt: int, knots: Trajectory, keys: Array) -> State:
+        """The first state of every row of an attempt."""
+        shared, own = self.question
+        state = begin(own, shared, replace(knots, slack=None), keys)
+        if attempt == 0 and isinstance(self.guess, Warm):
+            state = warmed(own, shared, state, self.guess)
+        return state
+
+    def _no_worse(self, found: Chains) -> Chains:
+        """What was found; for a chain whose guess was feasible and better, the guess."""
+        problem, guess = self.family.problem, self.guess
+        given = guess.knots if isinstance(guess, Warm) else guess
+        knots = initial_knots(problem, self.chains, given, jax.random.key(0))
+        info = evaluate(problem, replace(knots, slack=None))
+        state = replace(found.state, trajectory=replace(knots, slack=found.state.trajectory.slack))
+        gains = guess.gains if isinstance(guess, Warm) else jnp.zeros_like(state.gains)
+        state = replace(state, gains=gains)
+        guessed = Chains(state, info, np.zeros(self.chains, int))
+        better = _improved(found, guessed) & (np.asarray(info.max_violation) == 0.0)
+        source = np.arange(self.chains) + self.chains * better
+        state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
+        return Chains(state, info, np.where(better, 0, found.feasible_since))
 
     def _begin_chunk(self) -> None:
         """New initial knots and random numbers for every row."""
@@ -276,7 +304,7 @@ class Search:
             owners = np.concatenate([_owners(*row) for row in zip(left_alone, cost, strict=True)])
         knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, indices, stage.cost_scale)
-        state = begin(self.question[1], self.question[0], knots, keys)
+        state = self._begun(stage.attempt, knots, keys)
         _, info = jax.block_until_ready(self._iterated(state, 0, 0))
         now = Chains(state, info, np.full(len(owners), -1))
         ones = np.ones(len(owners))
@@ -358,7 +386,12 @@ class Search:
         key = jax.random.fold_in(jax.random.key(self.seed), attempt)
         if self.family.alone:
             key_knots, key_noise = jax.random.split(key)
-            knots = initial_knots(self.family.problem, self.chains, self.guess, key_knots)
+            first: Trajectory | None = None
+            if not isinstance(self.guess, Warm):
+                first = self.guess
+            elif attempt == 0:
+                first = self.guess.knots
+            knots = initial_knots(self.family.problem, self.chains, first, key_knots)
             return knots, key_noise
         keys = _keys_of(key, indices)
         guess = self.family.problem.guess
@@ -369,11 +402,12 @@ class Search:
         """The flow and the question of an attempt on some problems."""
         settings, cost = self.settings, cost_scale[indices]
         heated, flow = attempt > 0 and settings.heated, settings.flow
+        warm = attempt == 0 and isinstance(self.guess, Warm)
         noise = np.zeros(len(indices))
         if settings.descent is None:
             cost, noise = (np.broadcast_to(s, len(indices)) for s in vars(flow.scale).values())
         elif not heated:
-            flow = replace(flow, iterations=settings.descent)
+            flow = replace(flow, iterations=0 if warm else settings.descent)
         else:
             kept = self.stage.kept
             assert kept is not None

@@ -45,7 +45,14 @@ def initial_knots(
         if not np.isfinite(array).all():
             raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
         knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
-    return problem.started(Trajectory(knots[0], knots[1]))
+    start = (
+        None
+        if guess.start is None
+        else jnp.broadcast_to(
+            jnp.asarray(guess.start, problem.x_init.dtype), (chains, len(problem.free))
+        )
+    )
+    return problem.started(Trajectory(knots[0], knots[1], start=start))
 
 
 _draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))

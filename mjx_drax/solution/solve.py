@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
@@ -17,9 +18,10 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Progress, Search
 from mjx_drax.search.family import Family
-from mjx_drax.search.iterate import Question, feedback_gains, partition
+from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
@@ -32,7 +34,7 @@ def solve(
     chains: int = 64,
     seed: int = 0,
     solver: Langevin | Restarts | None = None,
-    guess: Trajectory | None = None,
+    guess: Trajectory | Solution | None = None,
     progress: Progress | None = None,
     record: int | None = None,
     devices: int = 1,
@@ -52,6 +54,10 @@ def solve(
             `Langevin` with its schedules in their own scale.
         guess: initial knots instead of random ones: one trajectory for all chains, (K, nx) and
             (K, nu), or one each, (chains, K, nx) and (chains, K, nu). They need not be feasible.
+            A solution, of this problem or of one with other numbers, is a warm start: its chains
+            go on from their knots, multipliers and barriers, at first without noise. Another
+            horizon cuts it off, or repeats its last stage. No chain ends worse than a feasible
+            guess.
         progress: called with (iterations done, of how many, diagnostics) every few iterations;
             Ctrl-C between two calls ends the solve early and keeps what there is.
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for
@@ -88,13 +94,14 @@ def solve(
         tolerances.of(problem)  # refuses those of another size
         settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
         recorder = None if record is None else Recorder(record)
+        given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess
         search = Search(
             Family.of_one(problem),
             chains,
             seed,
             settings,
             mesh=mesh_for(chains, devices),
-            guess=guess,
+            guess=given,
             checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
             recorder=recorder,
             progress=progress,
@@ -103,6 +110,21 @@ def solve(
         interrupted = search.stage.place < len(search.stage.todo)
         solution = _certified(problem, settings, seed, found, interrupted, tolerances)
     return solution if recorder is None else replace(solution, recording=recorder.recording())
+
+
+def warm_of(solution: Solution, problem: Problem, chains: int) -> Warm:
+    """The solution's chains for another solve, the best first; as often as there are places.
+
+    Raises:
+        DraxError: the problem has other sizes.
+    """
+    order = np.lexsort(ranking(solution.cost, solution.max_defect)[::-1])
+    dtype, gains = problem.x_init.dtype, jnp.asarray(solution.gains)
+    known = Warm(solution.trajectories, solution.multipliers, gains)
+    known = jax.tree.map(lambda a: jnp.asarray(a, dtype), known)
+    warm = known.rows(np.resize(order, chains)).of_length(problem.horizon)
+    require_alike(problem, warm)
+    return warm
 
 
 def _certified(
