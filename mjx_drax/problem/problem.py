@@ -312,7 +312,7 @@ class Problem:
         return self.dynamics.consistent(knots) if short else knots
 
     def replay(
-        self, plan: ArrayLike, u: ArrayLike, gains: ArrayLike
+        self, plan: ArrayLike, u: ArrayLike, gains: ArrayLike, knots: Knot | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """`Dynamics.replay` within the control bounds, from numbers of any precision.
 
@@ -320,11 +320,13 @@ class Problem:
             plan: planned states x_0..x_K, (chains, K + 1, nx).
             u: planned controls, (chains, K, nu).
             gains: feedback K_k, (chains, K, nu, ndx); zeros replay open loop.
+            knots: of the stages of every chain, if they differ, with an axis of chains in front.
         """
         limits = np.asarray(self.bounds.u_lower, float), np.asarray(self.bounds.u_upper, float)
         plan, u, gains = (np.asarray(given, float) for given in (plan, u, gains))
         with self.arithmetic():
-            return self.dynamics.replay(plan, u, gains, limits, self.knots.at(slice(-1)))
+            knots = self.knots.at(slice(-1)) if knots is None else knots
+            return self.dynamics.replay(plan, u, gains, limits, knots)
 
     def reached(self, x: np.ndarray) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.

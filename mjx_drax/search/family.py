@@ -218,8 +218,13 @@ class Family:
         self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """`Problem.replay` of those problems' plans, as many of each, problem by problem."""
-        if not self.varies("dynamics", "bounds", "data", "t_init"):
+        if self.alone:
             return self.problem.replay(plan, u, gains)
+        if not self.varies("dynamics", "bounds"):
+            with self.problem.arithmetic():
+                knots = self.mapped(lambda problem: problem.knots.at(slice(-1)))
+            each = np.repeat(indices, len(u) // len(indices))
+            return self.problem.replay(plan, u, gains, knots.at(each))
         parts = (np.split(a, len(indices)) for a in (plan, u, gains))
         ran = [self.at(int(i)).replay(*own) for i, *own in zip(indices, *parts, strict=True)]
         return np.concatenate([run[0] for run in ran]), np.concatenate([run[1] for run in ran])
