@@ -322,10 +322,10 @@ class MjxDynamics(Dynamics):
         """x + dx by the C engine, (nx,)."""
         return integrate(self.mj_model, x, dx)
 
-    def observe_replayed(self, x: np.ndarray) -> mujoco.MjData:
+    def observe_replayed(self, x: np.ndarray, time: float) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
         data = mujoco.MjData(self.mj_model)
-        data.time = 0.0 if self.time is None else float(self.time)
+        data.time = time
         set_state(self.mj_model, data, x)
         mujoco.mj_forward(self.mj_model, data)
         return data

@@ -170,8 +170,8 @@ class Dynamics:
         off = self.host_difference(states, np.broadcast_to(plan, states.shape))
         return np.abs(off).max(axis=-1)
 
-    def observe_replayed(self, x: np.ndarray) -> Any:
-        """What goal functions receive for a replayed state (nx,): here the state itself."""
+    def observe_replayed(self, x: np.ndarray, time: float) -> Any:
+        """What goal functions receive for a replayed state (nx,) at a time [s]: here the state."""
         return x
 
 

@@ -278,10 +278,9 @@ class Extended(Dynamics):
         moved = self.inner.host_integrate(x[..., : self.inner.nx], dx[..., : self.inner.ndx])
         return np.concatenate([moved, x[..., self.inner.nx :] + dx[..., self.inner.ndx :]], axis=-1)
 
-    def observe_replayed(self, x: np.ndarray) -> Any:
+    def observe_replayed(self, x: np.ndarray, time: float) -> Any:
         """What goal functions receive: as from the inner system."""
-        inner = self.inner if self.knot is None else self.inner.at(self.knot)
-        return inner.observe_replayed(self.inner_state(x))
+        return self.inner.observe_replayed(self.inner_state(x), time)
 
     def times(self, states: np.ndarray, t_init: float) -> np.ndarray:
         """Times of x'_0..x'_K (K + 1, nx), (K + 1,) [s]."""

@@ -328,8 +328,12 @@ class Problem:
             knots = self.knots.at(slice(-1)) if knots is None else knots
             return self.dynamics.replay(plan, u, gains, limits, knots)
 
-    def reached(self, x: np.ndarray) -> bool | None:
+    def reached(self, x: np.ndarray, time: float | None = None) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.
+
+        Args:
+            x: where it ends.
+            time: when [s]; None: at the end of the horizon.
 
         Raises:
             DraxError: the goal fails, or returns more than one truth value.
@@ -337,7 +341,8 @@ class Problem:
         if self.goal is None:
             return None
         try:
-            reached = np.asarray(self.goal(self.end.dynamics.observe_replayed(x)))
+            time = float(self.times[-1]) if time is None else time
+            reached = np.asarray(self.goal(self.dynamics.observe_replayed(x, time)))
         except Exception as error:
             raise DraxError(
                 f"goal failed at x = {shown(x.tolist())}: {reason(error)}. Make it a function of "

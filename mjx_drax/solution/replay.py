@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
@@ -165,7 +166,12 @@ def judged(
     cost, violations = measured(family, ran, off[:, -1], extents(problem, plan, u), tolerances)
     place = KINDS.index(GOAL)
     if problem.goal is not None:
-        reached = np.array([problem.reached(x) for x in states[:, -1]])
+        ends = [float(problem.times[-1])] * len(states)
+        if isinstance(problem.dynamics, Extended):  # each ends at a time of its own
+            times, begin = problem.dynamics.times, float(problem.t_init)
+            ends = [float(times(motion, begin)[-1]) for motion in states]
+        pairs = zip(states[:, -1], ends, strict=True)
+        reached = np.array([problem.reached(x, end) for x, end in pairs])
         finite = np.isfinite(states[:, -1]).all(axis=1)
         violations.size[:, place] = ~(reached & finite)
         violations.allowed[:, place] = 0.0

@@ -135,7 +135,7 @@ def test_costs_observe_what_the_c_engine_computes():
     task = problem("acrobot")
     x, u = drawn(task)
     seen = jax.jit(task.dynamics.observe)(x[0].astype(np.float32), u[0].astype(np.float32))
-    wanted = task.dynamics.observe_replayed(x[0])
+    wanted = task.dynamics.observe_replayed(x[0], 0.0)
     for part in ("qpos", "qvel", "site_xpos", "xpos"):
         np.testing.assert_allclose(getattr(seen, part), getattr(wanted, part), atol=1e-5)
 
