@@ -22,6 +22,7 @@ from .method.schedules import Constant as Constant
 from .method.schedules import Geometric as Geometric
 from .method.schedules import Scale as Scale
 from .modelling import guesses as guesses
+from .modelling import obstacles as obstacles
 from .modelling.terms import Terms as Terms
 from .physics.mjcf import from_mjcf as from_mjcf
 from .polish.interior_point import Polish as Polish
