@@ -21,7 +21,8 @@ Which values are exact:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,11 +33,14 @@ from mjx_drax.physics.engine import mujoco
 
 
 class Shape(NamedTuple):
-    """A geom: centre (3,) [m], axes as the columns of frame (3, 3), and MuJoCo's size (3,) [m]."""
+    """A geom: centre (3,) [m], axes as the columns of frame (3, 3), and MuJoCo's size (3,) [m].
+
+    In place of its size a mesh has its `hulls.Hull`.
+    """
 
     centre: Array
     frame: Array
-    size: Array
+    size: Any
 
     def seen_from(self, other: Shape) -> tuple[Array, Array]:
         """Centre (3,) and frame (3, 3) in the frame of another shape."""
@@ -105,23 +109,31 @@ def _sphere_cylinder(sphere: Shape, cylinder: Shape) -> Array:
 
 
 def _capsule_cylinder(capsule: Shape, cylinder: Shape) -> Array:
-    """The least distance along the capsule's axis, found by bisection of its slope."""
+    """The least distance along the capsule's axis."""
     centre, frame = capsule.seen_from(cylinder)
     half = capsule.size[1] * frame[:, 2]
+    t = least_along(lambda size, point: _to_cylinder(point, size), cylinder.size, centre, half)
+    return _to_cylinder(centre + t * half, cylinder.size) - capsule.size[0]
 
-    def least(centre: Array, half: Array, size: Array) -> Array:
+
+def least_along(distance: Callable[..., Array], shape: Any, centre: Array, half: Array) -> Array:
+    """t in [-1, 1] where distance(shape, centre + t half) is least, by bisection of its slope.
+
+    The distance must be convex in the point; t is not differentiated.
+    """
+
+    def least(shape: Any, centre: Array, half: Array) -> Array:
         def bisect(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             low, high = ends
             middle = (low + high) / 2
             at = (centre + middle * half,)
-            _, slope = jax.jvp(lambda point: _to_cylinder(point, size), at, (half,))
+            _, slope = jax.jvp(partial(distance, shape), at, (half,))
             return jnp.where(slope > 0, low, middle), jnp.where(slope > 0, middle, high)
 
         low, high = lax.fori_loop(0, 24, bisect, (-jnp.ones(()), jnp.ones(())))
         return (low + high) / 2
 
-    t = least(*lax.stop_gradient((centre, half, cylinder.size)))
-    return _to_cylinder(centre + t * half, cylinder.size) - capsule.size[0]
+    return least(*lax.stop_gradient((shape, centre, half)))
 
 
 def _capsule_box(capsule: Shape, box: Shape) -> Array:
