@@ -21,7 +21,6 @@ Which values are exact:
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -76,21 +75,22 @@ def _capsule_capsule(one: Shape, other: Shape) -> Array:
     between = one.centre - other.centre
     a, b = one.size[1] * one.frame[:, 2], other.size[1] * other.frame[:, 2]
 
-    def nearest(w: Array, a: Array, b: Array) -> tuple[Array, Array]:
-        """Candidates s, t (5,) for the least |w + s a - t b| with |s|, |t| <= 1."""
-        aa, bb, ab, wa, wb = a @ a, b @ b, a @ b, w @ a, w @ b
-        inside = _ratio(ab * wb - wa * bb, aa * bb - ab**2)
-        s = jnp.clip(jnp.array([inside, -1.0, 1.0]), -1.0, 1.0)
-        t = jnp.array([-1.0, 1.0])
-        s_of_t, t_of_s = (
-            jnp.clip(_ratio(ab * at + shift, square), -1.0, 1.0)
-            for at, shift, square in ((t, -wa, aa), (s, wb, bb))
-        )
-        return jnp.concatenate([s, s_of_t]), jnp.concatenate([t_of_s, t])
-
-    s, t = lax.stop_gradient(nearest(between, a, b))
+    s, t = lax.stop_gradient(nearest_of_segments(between, a, b))
     apart = norm(between + s[:, None] * a - t[:, None] * b)
     return apart.min() - one.size[0] - other.size[0]
+
+
+def nearest_of_segments(w: Array, a: Array, b: Array) -> tuple[Array, Array]:
+    """Candidates s, t (5,) for the least |w + s a - t b| with |s|, |t| <= 1."""
+    aa, bb, ab, wa, wb = a @ a, b @ b, a @ b, w @ a, w @ b
+    inside = _ratio(ab * wb - wa * bb, aa * bb - ab**2)
+    s = jnp.clip(jnp.array([inside, -1.0, 1.0]), -1.0, 1.0)
+    t = jnp.array([-1.0, 1.0])
+    s_of_t, t_of_s = (
+        jnp.clip(_ratio(ab * at + shift, square), -1.0, 1.0)
+        for at, shift, square in ((t, -wa, aa), (s, wb, bb))
+    )
+    return jnp.concatenate([s, s_of_t]), jnp.concatenate([t_of_s, t])
 
 
 def _to_prism(excess: Array) -> Array:
@@ -109,31 +109,23 @@ def _sphere_cylinder(sphere: Shape, cylinder: Shape) -> Array:
 
 
 def _capsule_cylinder(capsule: Shape, cylinder: Shape) -> Array:
-    """The least distance along the capsule's axis."""
+    """The least distance along the capsule's axis, found by bisection of its slope."""
     centre, frame = capsule.seen_from(cylinder)
     half = capsule.size[1] * frame[:, 2]
-    t = least_along(lambda size, point: _to_cylinder(point, size), cylinder.size, centre, half)
-    return _to_cylinder(centre + t * half, cylinder.size) - capsule.size[0]
 
-
-def least_along(distance: Callable[..., Array], shape: Any, centre: Array, half: Array) -> Array:
-    """t in [-1, 1] where distance(shape, centre + t half) is least, by bisection of its slope.
-
-    The distance must be convex in the point; t is not differentiated.
-    """
-
-    def least(shape: Any, centre: Array, half: Array) -> Array:
+    def least(centre: Array, half: Array, size: Array) -> Array:
         def bisect(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             low, high = ends
             middle = (low + high) / 2
             at = (centre + middle * half,)
-            _, slope = jax.jvp(partial(distance, shape), at, (half,))
+            _, slope = jax.jvp(lambda point: _to_cylinder(point, size), at, (half,))
             return jnp.where(slope > 0, low, middle), jnp.where(slope > 0, middle, high)
 
         low, high = lax.fori_loop(0, 24, bisect, (-jnp.ones(()), jnp.ones(())))
         return (low + high) / 2
 
-    return least(*lax.stop_gradient((shape, centre, half)))
+    t = least(*lax.stop_gradient((centre, half, cylinder.size)))
+    return _to_cylinder(centre + t * half, cylinder.size) - capsule.size[0]
 
 
 def _capsule_box(capsule: Shape, box: Shape) -> Array:
