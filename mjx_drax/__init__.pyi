@@ -22,6 +22,7 @@ from .method.schedules import Constant as Constant
 from .method.schedules import Geometric as Geometric
 from .method.schedules import Scale as Scale
 from .modelling import guesses as guesses
+from .modelling import obstacles as obstacles
 from .modelling.moments import at_time as at_time
 from .modelling.moments import between as between
 from .modelling.terms import Terms as Terms

@@ -1,5 +1,5 @@
-"""Helpers to pose a problem: terms of costs, distances, initial guesses."""
+"""Helpers to pose a problem: terms of costs, distances, obstacles, initial guesses."""
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["guesses"])
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["guesses", "obstacles"])

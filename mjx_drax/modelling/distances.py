@@ -21,7 +21,7 @@ Which values are exact:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,11 +32,14 @@ from mjx_drax.physics.engine import mujoco
 
 
 class Shape(NamedTuple):
-    """A geom: centre (3,) [m], axes as the columns of frame (3, 3), and MuJoCo's size (3,) [m]."""
+    """A geom: centre (3,) [m], axes as the columns of frame (3, 3), and MuJoCo's size (3,) [m].
+
+    In place of its size a mesh has its `hulls.Hull`.
+    """
 
     centre: Array
     frame: Array
-    size: Array
+    size: Any
 
     def seen_from(self, other: Shape) -> tuple[Array, Array]:
         """Centre (3,) and frame (3, 3) in the frame of another shape."""
@@ -72,21 +75,22 @@ def _capsule_capsule(one: Shape, other: Shape) -> Array:
     between = one.centre - other.centre
     a, b = one.size[1] * one.frame[:, 2], other.size[1] * other.frame[:, 2]
 
-    def nearest(w: Array, a: Array, b: Array) -> tuple[Array, Array]:
-        """Candidates s, t (5,) for the least |w + s a - t b| with |s|, |t| <= 1."""
-        aa, bb, ab, wa, wb = a @ a, b @ b, a @ b, w @ a, w @ b
-        inside = _ratio(ab * wb - wa * bb, aa * bb - ab**2)
-        s = jnp.clip(jnp.array([inside, -1.0, 1.0]), -1.0, 1.0)
-        t = jnp.array([-1.0, 1.0])
-        s_of_t, t_of_s = (
-            jnp.clip(_ratio(ab * at + shift, square), -1.0, 1.0)
-            for at, shift, square in ((t, -wa, aa), (s, wb, bb))
-        )
-        return jnp.concatenate([s, s_of_t]), jnp.concatenate([t_of_s, t])
-
-    s, t = lax.stop_gradient(nearest(between, a, b))
+    s, t = lax.stop_gradient(nearest_of_segments(between, a, b))
     apart = norm(between + s[:, None] * a - t[:, None] * b)
     return apart.min() - one.size[0] - other.size[0]
+
+
+def nearest_of_segments(w: Array, a: Array, b: Array) -> tuple[Array, Array]:
+    """Candidates s, t (5,) for the least |w + s a - t b| with |s|, |t| <= 1."""
+    aa, bb, ab, wa, wb = a @ a, b @ b, a @ b, w @ a, w @ b
+    inside = _ratio(ab * wb - wa * bb, aa * bb - ab**2)
+    s = jnp.clip(jnp.array([inside, -1.0, 1.0]), -1.0, 1.0)
+    t = jnp.array([-1.0, 1.0])
+    s_of_t, t_of_s = (
+        jnp.clip(_ratio(ab * at + shift, square), -1.0, 1.0)
+        for at, shift, square in ((t, -wa, aa), (s, wb, bb))
+    )
+    return jnp.concatenate([s, s_of_t]), jnp.concatenate([t_of_s, t])
 
 
 def _to_prism(excess: Array) -> Array:

@@ -26,6 +26,7 @@ from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.base.numbers import numbers as real_numbers
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.modelling.distances import DISTANCES, SPHERE, Shape
+from mjx_drax.modelling.hulls import HULL_DISTANCES, MESH, hulls_of
 from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
@@ -250,6 +251,8 @@ class Terms:
 
         One value for each of `geoms` with each of `others`, which vary fastest. Distances
         are signed; `modelling.distances` says for which pairs they are exact (all but two kinds).
+        A mesh counts as its convex hull, and has distances from planes, spheres, capsules and
+        boxes: `modelling.hulls`.
 
         Args:
             geoms: name or names.
@@ -267,7 +270,7 @@ class Terms:
             for b in seconds:
                 low, high = sorted((a, b), key=lambda g: int(model.geom_type[g]))
                 kinds = int(model.geom_type[low]), int(model.geom_type[high])
-                if a == b or kinds not in DISTANCES:
+                if a == b or kinds not in _DISTANCES:
                     raise DraxError(_no_distance(model, a, b))
                 count = sum(map(len, groups.values()))
                 groups.setdefault(kinds, []).append((low, high, count))
@@ -275,7 +278,11 @@ class Terms:
         order = tuple(int(i) for i in np.argsort([place for *_, place in pairs]))
         where = tuple((kinds, *zip(*group, strict=True)) for kinds, group in groups.items())
         wanted = _numbers("margin of clearance", margin, len(pairs), alike=True)
-        used = tuple(sizes[np.array(group)[:, :2]] for group in groups.values())
+        used = []
+        for kinds, group in groups.items():
+            firsts, seconds, _ = map(list, zip(*group, strict=True))
+            mesh = kinds[1] == MESH
+            used.append((sizes[firsts], hulls_of(model, seconds) if mesh else sizes[seconds]))
         return _term(_clearance, (where, order), (wanted, *used), "clearance", len(pairs), 1.0)
 
     def _pose(
@@ -319,6 +326,7 @@ class Terms:
         return found
 
 
+_DISTANCES = DISTANCES | HULL_DISTANCES
 _QPOS = np.array([7, 4, 1, 1])  # numbers in the position of a free, ball, slide and hinge joint
 
 
@@ -353,16 +361,16 @@ def _upright(data: Any, u: Array | None, where: tuple[Any, ...], axis: Array, up
 
 
 def _clearance(
-    data: Any, u: Array | None, where: tuple[Any, ...], margin: Array, *sizes: Array
+    data: Any, u: Array | None, where: tuple[Any, ...], margin: Array, *sizes: Any
 ) -> Array:
     groups, order = where
     distances = []
     for (kinds, low, high, _), size in zip(groups, sizes, strict=True):
         shapes = [
-            Shape(data.geom_xpos[at], data.geom_xmat[at], size[:, side])
-            for side, at in enumerate((np.array(low), np.array(high)))
+            Shape(data.geom_xpos[at], data.geom_xmat[at], own)
+            for own, at in zip(size, (np.array(low), np.array(high)), strict=True)
         ]
-        distances.append(jax.vmap(DISTANCES[kinds])(*shapes))
+        distances.append(jax.vmap(_DISTANCES[kinds])(*shapes))
     return margin - jnp.concatenate(distances)[np.array(order)]
 
 
@@ -448,8 +456,7 @@ def _term(
     weight: ArrayLike,
 ) -> Term:
     scale = jnp.sqrt(jnp.asarray(_weights(label, size, weight)))
-    made = (n if isinstance(n, Reference) else jnp.asarray(n) for n in numbers)
-    return Term(function, where, tuple(made), scale)
+    return Term(function, where, jax.tree.map(jnp.asarray, tuple(numbers)), scale)
 
 
 def _no_distance(model: mujoco.MjModel, a: int, b: int) -> str:
