@@ -18,7 +18,7 @@ HELP = """\
 A cost file is Python. It defines at least one of
   running_cost(data, u), terminal_cost(data)           scalars
   running_residual(data, u), terminal_residual(data)   vectors: adds half the squared norm
-on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
+on mjx.Data (qpos, qvel, data.site("tip").xpos, data.sensor("touch").data, ...), and may define
   goal(data) -> bool       what a replay in MuJoCo must reach
   equality(data, u), terminal_equality(data)       vectors held at 0
   inequality(data, u), terminal_inequality(data)   vectors held <= 0

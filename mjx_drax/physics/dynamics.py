@@ -26,6 +26,7 @@ from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.engine import Rollout, mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
+from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.physics.states import difference, integrate, quiet, set_state
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
@@ -199,9 +200,9 @@ class MjxDynamics(Dynamics):
         """f(x, u), (nx,)."""
         return _step(self.model, self.structure, self.substeps, x, u)
 
-    def observe(self, x: Array, u: Array) -> mjx.Data:
+    def observe(self, x: Array, u: Array) -> Observed:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
-        return _observe(self.model, self.structure, x, u)
+        return Observed.of(self.model, _observe(self.model, self.structure, x, u))
 
     @property
     def kinked(self) -> bool:  # type: ignore[override]

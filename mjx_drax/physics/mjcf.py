@@ -58,8 +58,10 @@ def from_mjcf(
     """A problem whose dynamics are those of a MuJoCo model.
 
     Costs see `mjx.Data` after `mjx.forward` (qpos, qvel, site and body positions, sensors, ...);
-    what they do not read is not computed. Joint ranges and control ranges of the model become
-    bounds, which are intersected with `x_bounds` and `u_bounds`.
+    what they do not read is not computed. As in `mujoco.MjData`, `data.site("tip").xpos` is read by
+    name, and so is what bodies, geoms, joints, sensors, ... have, in the same shapes. Joint ranges
+    and control ranges of the model become bounds, which are intersected with `x_bounds` and
+    `u_bounds`.
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
