@@ -116,11 +116,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT as (height, width)."""
+    """WIDTHxHEIGHT as (width, height)."""
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit()):
         raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT, such as 640x480")
-    return int(height), int(width)
+    return int(width), int(height)
 
 
 def run(options: argparse.Namespace) -> int:

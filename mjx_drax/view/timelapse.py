@@ -27,7 +27,7 @@ def render_timelapse(
     path: str | os.PathLike[str],
     *,
     count: int = 8,
-    size: tuple[int, int] = (720, 960),
+    size: tuple[int, int] = (960, 720),
     camera: str | int | None = None,
 ) -> Path:
     """One picture of the best chain's motion as it was replayed: ghosts, and the last pose.
@@ -38,7 +38,7 @@ def render_timelapse(
       solution: from `solve`, of a problem with a model.
       path: where to, ending in .png; its folder is made if need be.
       count: number of poses, the last one included.
-      size: (height, width) [pixels].
+      size: (width, height) [pixels].
       camera: a camera of the model, see `motion_frames`; None frames the motion.
 
     Raises:
@@ -46,7 +46,7 @@ def render_timelapse(
     """
     from PIL import Image
 
-    height, width = even_size(size)
+    width, height = even_size(size)
     require_whole("count", count)
     model = mujoco_model(solution.problem.dynamics)
     if model is None:

@@ -39,7 +39,7 @@ def render(
     path: str | os.PathLike[str],
     *,
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
+    size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
@@ -53,7 +53,7 @@ def render(
       solution: from `solve`.
       path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       fps: frames per second.
-      size: (height, width) [pixels].
+      size: (width, height) [pixels].
       camera: a camera of the model, see `motion_frames`.
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
@@ -79,7 +79,7 @@ def check(
     problem: Problem,
     *,
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
+    size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
@@ -132,7 +132,7 @@ def motion_frames(
     *,
     overlay: Sequence[str] = (),
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
+    size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
 ) -> Generator[Frame, None, None]:
@@ -144,7 +144,7 @@ def motion_frames(
       times: when they are reached (T,) [s], not decreasing.
       overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
       fps: frames per second.
-      size: (height, width) [pixels]; odd ones are made even, which players ask for.
+      size: (width, height) [pixels]; odd ones are made even, which players ask for.
       camera: a camera's name or index; "free" is one that sees the whole motion. None takes the
         one called "main", or, in a model without one, the free one.
       speed: of the motion; 0.5 is slow motion.
@@ -157,7 +157,7 @@ def motion_frames(
     moments = frame_times(knot_times, fps, speed)
     if isinstance(overlay, str):
         raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
-    height, width = even_size(size)
+    width, height = even_size(size)
     scene = Scene(model, camera_for(model, positions, camera, width / height))
 
     def frames() -> Generator[Frame, None, None]:
@@ -210,8 +210,9 @@ def _drawn_frames(
     size: tuple[int, int],
 ) -> Generator[Frame, None, None]:
     """Frames at some moments [s] of states (T, nx), drawn again at each knot, below the overlay."""
-    top = text_box(overlay, *size)[1][3] / size[0]
-    canvas, drawn = Canvas.within(*size, top=top), -1
+    width, height = size
+    top = text_box(overlay, height, width)[1][3] / height
+    canvas, drawn = Canvas.within(height, width, top=top), -1
     for time in moments:
         knot = knot_at(times, time)
         if knot != drawn:
