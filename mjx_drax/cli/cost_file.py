@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import sys
 from pathlib import Path
@@ -30,7 +31,12 @@ on mjx.Data (qpos, qvel, data.site("tip").xpos, data.sensor("touch").data, ...),
   contacts                 how many contact points the plan keeps, the nearest ones; False: none
   derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin
+Other names are yours, but for those that are nearly one of these: they are taken for slips.
 """
+
+FUNCTION_ALIKE, VALUE_ALIKE = 0.77, 0.9
+"""How much of a name has to be that of a known one to be taken for a slip: `final_cost` is one,
+the numbers `u_init` and `x_goal` are not."""
 
 
 def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restarts]:
@@ -39,7 +45,8 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restart
     The file may define every argument of `from_mjcf` by its name.
 
     Raises:
-        DraxError: the file is missing, fails, or misses something; or the problem cannot be built.
+        DraxError: the file is missing, fails, misses something, or defines what is nearly one of
+            the known names; or the problem cannot be built.
     """
     from inspect import signature
 
@@ -48,6 +55,7 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restart
 
     module = _module(Path(cost))
     names = set(signature(from_mjcf).parameters) - {"model", "name"}
+    _require_no_slips(module, {*names, "solver"}, cost)
     given = {name: value for name, value in vars(module).items() if name in names}
     if horizon is not None:
         given["horizon"] = horizon
@@ -55,6 +63,25 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restart
         raise DraxError(f"no horizon: define it in {cost} or give --horizon SECONDS.")
     problem = from_mjcf(model, name=Path(model).stem, **given)
     return problem, as_restarts(getattr(module, "solver", None))
+
+
+def _require_no_slips(module: ModuleType, known: set[str], cost: str) -> None:
+    """Complain about a definition that would be ignored, and whose name is nearly a known one.
+
+    What is imported does not count, nor what begins with an underscore, nor a name whose known one
+    is defined as well: that is a helper's.
+    """
+    missing = sorted(known - set(vars(module)))
+    for name, value in vars(module).items():
+        imported = getattr(value, "__module__", module.__name__) != module.__name__
+        if name.startswith("_") or name in known or imported or isinstance(value, ModuleType):
+            continue
+        alike = FUNCTION_ALIKE if callable(value) else VALUE_ALIKE
+        for meant in difflib.get_close_matches(name.lower(), missing, 1, alike):
+            raise DraxError(
+                f"{cost} defines {name}, which is not a known name: rename it to {meant}, or to "
+                f"_{name} if it is something else."
+            )
 
 
 def _module(path: Path) -> ModuleType:

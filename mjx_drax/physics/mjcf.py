@@ -18,6 +18,7 @@ from mjx_drax.physics.checks import (
     require_same_step,
     require_traceable,
     warn_of_lost_contacts,
+    warn_of_start_beyond_limits,
 )
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
@@ -101,7 +102,8 @@ def from_mjcf(
             function computes something else when it is traced again.
 
     Warns:
-        DraxWarning: MJX computes the model a little differently from the C engine.
+        DraxWarning: MJX computes the model a little differently from the C engine; x_init lies
+            outside of a joint's range; more contacts act at x_init than the plan keeps.
     """
     given = {
         "running_cost": running_cost,
@@ -123,6 +125,7 @@ def from_mjcf(
     dt = substeps * mj_model.opt.timestep
     K = knots(horizon, dt)
     x0, bounded = checked_start(mj_model, name, x_init)
+    warn_of_start_beyond_limits(mj_model, name, x0)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
     require_traceable(mj_model, name, dynamics.observe)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
-from mjx_drax.cli import main
+from mjx_drax.cli import cost_file, main
 from mjx_drax.physics.report import text
 from mjx_drax.search.engine import REPORT_EVERY
 
@@ -294,6 +294,17 @@ def test_help_names_all_that_a_cost_file_may_define(capsys):
     out = capsys.readouterr().out
     for name in set(signature(from_mjcf).parameters) - {"model", "name"}:
         assert re.search(rf"\b{name}\b", out), name
+
+
+def test_a_cost_file_has_names_of_its_own(own):
+    """Helpers, imports, and what a known name beside it shows to be meant."""
+    (own / "mycost.py").write_text(
+        COST + "import jax.numpy as guesses\nfrom math import cos as horizons\n"
+        "u_init = x_goal = q_goal = 1.0\nu_bound = 2.0\nu_bounds = (-u_bound, u_bound)\n"
+        "def terminal(data):\n    return data.qpos\ndef _goall(data):\n    return True\n"
+    )
+    problem, _ = cost_file.load(str(own / "slider.xml"), str(own / "mycost.py"), None)
+    assert float(problem.bounds.u_upper[0]) <= 2.0
 
 
 def test_errors_name_cause_and_fix(own, capsys):
