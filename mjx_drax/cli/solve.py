@@ -134,7 +134,6 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     """The same, in the precision that JAX has now."""
     problem, solver, chains, draw = _asked(options)
-    from mjx_drax.cli import summary
     from mjx_drax.search.restarts import settled
     from mjx_drax.solution import save as results
     from mjx_drax.solution.solve import solve
@@ -183,8 +182,7 @@ def _run(options: argparse.Namespace) -> int:
     written += export.write(solution, folder, wanted, tell)
     if options.log:
         tell(solution.log())
-    for line in summary.lines(solution):
-        tell(line)
+    tell(str(solution))
     tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:
         tell(f"film written to {film}")

@@ -34,18 +34,22 @@ from mjx_drax.solution.replay import (
     open_loop_is_better,
     plan_violations,
 )
+from mjx_drax.solution.report import counts, html
 from mjx_drax.solution.results import statuses, tolerance_of
 from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
 
+FEW = 10
+"""So many problems that are not certified are printed by number."""
+
 COPIES = 40
 """Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes. XLA
 plans with 7 to 8 for the cart-pole and the acrobot on a CPU; the rest is for what was not tried."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BatchSolution:
     """The best chain of every problem, certified.
 
@@ -62,6 +66,8 @@ class BatchSolution:
         tolerances: of violations of replays.
         open_loop, feedback: replays of the best chains, over problems.
         compile_time, solve_time, replay_time: [s].
+
+    `print(batch)` shows how many problems are certified and optimal, and what they cost.
     """
 
     family: Family
@@ -80,6 +86,38 @@ class BatchSolution:
     compile_time: float
     solve_time: float
     replay_time: float
+
+    def __repr__(self) -> str:
+        return f"<BatchSolution of {self.family.problem.name}: {self._verdict}>"
+
+    def __str__(self) -> str:
+        return "\n".join(self._report())
+
+    def _repr_html_(self) -> str:
+        return html(self._report(), bool(self.certified.all()))
+
+    @property
+    def _verdict(self) -> str:
+        certified, optimal = (int(which.sum()) for which in (self.certified, self.optimal))
+        return f"{certified} of {len(self.best)} problems CERTIFIED, {optimal} of them optimal"
+
+    def _report(self) -> list[str]:
+        cost = self.cost[self.certified]
+        low, middle, high = np.quantile(cost, (0, 0.5, 1)) if cost.size else [np.nan] * 3
+        said = [
+            f"problems       {len(self.best)} of {self.chain_cost.shape[1]} chains each: "
+            f"{counts(self.status)}",
+            f"cost           {low:.5g} to {high:.5g}, median {middle:.5g}, of certified replays",
+            f"engine         {self.family.problem.dynamics.engine}",
+            f"time           compile {self.compile_time:.1f} s, solve {self.solve_time:.1f} s, "
+            f"replay {self.replay_time:.1f} s",
+        ]
+        missed = np.flatnonzero(~self.certified)
+        if missed.size:
+            more = ", ..." if missed.size > FEW else ""
+            numbers = ", ".join(map(str, missed[:FEW].tolist()))
+            said.append(f"not certified  problems {numbers}{more}; where(i) says what i breaks")
+        return [*said, self._verdict]
 
     @property
     def cost(self) -> np.ndarray:

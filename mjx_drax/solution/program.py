@@ -32,7 +32,8 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of, table
 from mjx_drax.solution.replay import plan_violations
-from mjx_drax.solution.results import endings, stalled_of, statuses, tolerance_of
+from mjx_drax.solution.report import counts, html
+from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
 from mjx_drax.solution.violations import Violation
 
 
@@ -84,7 +85,7 @@ def from_program(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Minimum:
     """Where the chains of a nonlinear program ended. Arrays are numpy's.
 
@@ -101,6 +102,8 @@ class Minimum:
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
         interrupted: whether the solve was ended before its time.
         history: of all chains by iteration; see `Solution`.
+
+    `print(minimum)` shows how many chains are optimal, and the best one.
     """
 
     program: Problem
@@ -115,6 +118,32 @@ class Minimum:
     died_at: np.ndarray
     interrupted: bool
     history: dict[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        return f"<Minimum of {self.program.name}: {len(self.cost)} chains, {self._verdict}>"
+
+    def __str__(self) -> str:
+        return "\n".join(self._report())
+
+    def _repr_html_(self) -> str:
+        return html(self._report(), self.optimal)
+
+    @property
+    def _verdict(self) -> str:
+        """What is known of the best chain, with its cost."""
+        return f"{self.status[self.best_chain]}, cost {self.cost[self.best_chain]:.5g}"
+
+    def _report(self) -> list[str]:
+        best, where = self.best_chain, self.where(self.best_chain)
+        broken = "" if where is None else f": {where.told(self.program)}"
+        found = optimality(float(self.residual[best]), self.tolerance, self.polished[best])
+        return [
+            f"chains         {len(self.cost)}: {counts(self.status)}",
+            f"best           cost {self.cost[best]:.5g}, max|h| {self.max_defect[best]:.1e}",
+            f"optimality     {found}",
+            f"x              {shown([float(f'{x:.6g}') for x in self.best], 160)}",
+            f"{self.status[best]}{broken}",
+        ]
 
     def log(self) -> str:
         """The history as a table, a line for each report; see `Solution.log`."""

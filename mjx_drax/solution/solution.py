@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
+from mjx_drax.solution import report
 from mjx_drax.solution.load import load
 from mjx_drax.solution.replay import both_ways
 from mjx_drax.solution.results import Results
@@ -18,7 +19,20 @@ from mjx_drax.solution.violations import Tolerances, as_tolerances
 
 
 class Solution(Results):
-    """All chains of a solve, what they reached, and how they replay; see `Results`."""
+    """All chains of a solve, what they reached, and how they replay; see `Results`.
+
+    `print(solution)` shows the report that `mjx-drax solve` ends with, and a notebook the same as a
+    table.
+    """
+
+    def __repr__(self) -> str:
+        return report.in_a_line(self)
+
+    def __str__(self) -> str:
+        return "\n".join(report.lines(self))
+
+    def _repr_html_(self) -> str:
+        return report.html(report.lines(self), self.certified)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write `result.json` and `result.npz` into a folder, for `load`; see `results.save`.

@@ -1,0 +1,61 @@
+"""What `print` and notebooks show of a solution."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from builders import made_up, point, robot
+
+from mjx_drax import Restarts, from_program, minimize, solve_batch
+
+ONCE = Restarts(descent=5, attempts=1)
+
+
+def test_print_is_the_report_and_repr_one_line():
+    solution = made_up(robot())
+    text = str(solution)
+    assert text.splitlines()[0] == ("chains         2: 2 feasible; 100.0% succeed when replayed")
+    assert text.splitlines()[-1] == solution.verdict == "CERTIFIED, not known to be optimal"
+    assert f"engine         {solution.engine}" in text
+    assert repr(solution) == (
+        "<Solution of arm: 2 chains, CERTIFIED, not known to be optimal, cost 0 when replayed>"
+    )
+    assert f"{[solution]}" == f"[{solution!r}]"
+
+
+def test_a_notebook_shows_the_report_as_a_table_and_no_markup_of_others():
+    solution = made_up(point(name="a<b>&c"))
+    good = solution._repr_html_()
+    assert "<b>" not in good
+    assert good.index("CERTIFIED") < good.index("<table>")
+    for line in str(solution).splitlines()[:-1]:
+        assert line[:15].strip() in good
+    bad = replace(solution, max_defect=np.ones(2, np.float32))
+    assert "NOT CERTIFIED: no plan is feasible" in str(bad).splitlines()[-1]
+    colors = [text.split("color:")[1][:7] for text in (good, bad._repr_html_())]
+    assert colors[0] != colors[1]
+
+
+def test_a_minimum_is_shown_with_its_cost_and_what_it_breaks():
+    program = from_program(2, cost=lambda z: z @ z, equality=lambda z: z[:1] - 1.0, name="square")
+    found = minimize(program, chains=2, solver=Restarts(descent=20, attempts=1))
+    text = str(found)
+    cost = f"cost {found.cost[found.best_chain]:.5g}"
+    assert f"best           {cost}, max|h| " in text
+    assert repr(found) == f"<Minimum of square: 2 chains, {text.splitlines()[-1]}, {cost}>"
+    off = replace(found, x=found.x + 1.0, max_defect=np.ones(2))
+    assert str(off).splitlines()[-1].startswith("infeasible: breaks equality [0] by 1.0e+00")
+    assert "infeasible" in off._repr_html_()
+
+
+def test_a_batch_is_shown_by_its_counts_and_by_what_failed():
+    problem = point()
+    starts = jnp.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]])
+    found = solve_batch(lambda x: replace(problem, x_init=x), starts, chains=2, solver=ONCE)
+    assert f"{found!r}".startswith("<BatchSolution of point: 3 of 3 problems CERTIFIED")
+    assert str(found).startswith("problems       3 of 2 chains each: ")
+    lost = replace(found, chain_defect=np.array([[0, 0], [1, 1], [0, 0]], np.float32))
+    assert "not certified  problems 1; where(i)" in str(lost)
+    assert "2 of 3 problems CERTIFIED" in lost._repr_html_()
+    none = replace(found, chain_defect=np.ones((3, 2), np.float32))
+    assert "0 of 3 problems CERTIFIED" in str(none)
