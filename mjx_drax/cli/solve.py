@@ -109,7 +109,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--log",
         action="store_true",
-        help="also print cost, max|h| and residual by iteration; plot.png draws them",
+        help="also print cost, max|h| and residual by iteration, which plot.png draws, and the "
+        "worst violations by name and knot",
     )
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
@@ -182,6 +183,7 @@ def _run(options: argparse.Namespace) -> int:
     written += export.write(solution, folder, wanted, tell)
     if options.log:
         tell(solution.log())
+        tell(solution.worst())
     tell(str(solution))
     tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:

@@ -12,6 +12,10 @@ _POSITIONS = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
     int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
 }
+_ROTATIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "rx", "ry", "rz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("rx", "ry", "rz"),
+}
 _VELOCITIES = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
     int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
@@ -30,6 +34,23 @@ def state_names(dynamics: Dynamics) -> list[str]:
         return [f"x{i}" for i in range(dynamics.nx)]
     return [
         *_joint_names(model, "qpos", _POSITIONS),
+        *_joint_names(model, "qvel", _VELOCITIES),
+        *_activation_names(model),
+    ]
+
+
+def difference_names(dynamics: Dynamics) -> list[str]:
+    """Names of the entries of a difference of states, ndx of them.
+
+    Those of the state, but for the rotation vectors of ball and free joints, _rx, _ry, _rz.
+    """
+    model = mujoco_model(dynamics)
+    if dynamics.nx == dynamics.ndx:
+        return state_names(dynamics)
+    if model is None:
+        return [f"coordinate {i}" for i in range(dynamics.ndx)]
+    return [
+        *_joint_names(model, "qpos", _ROTATIONS),
         *_joint_names(model, "qvel", _VELOCITIES),
         *_activation_names(model),
     ]

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from builders import made_up, point, robot
+import pytest
+from builders import BALL, arm, made_up, point, robot
 
-from mjx_drax import Restarts, from_program, minimize, solve_batch
+from mjx_drax import DraxError, Restarts, Solution, from_program, minimize, solve_batch
+from mjx_drax.solution.names import difference_names
 
 ONCE = Restarts(descent=5, attempts=1)
 
@@ -34,6 +36,49 @@ def test_a_notebook_shows_the_report_as_a_table_and_no_markup_of_others():
     assert "NOT CERTIFIED: no plan is feasible" in str(bad).splitlines()[-1]
     colors = [text.split("color:")[1][:7] for text in (good, bad._repr_html_())]
     assert colors[0] != colors[1]
+
+
+def test_worst_names_entry_and_knot_of_plan_and_replay():
+    problem = point(
+        inequality=lambda x, u: jnp.stack([x[0] - 1.0, 2.0 * u[1] - 0.1]),
+        u_bounds=(-1.0, 1.0),
+        goal=lambda x: True,
+    )
+    made = made_up(problem)
+    x, u = made.trajectories.x.copy(), made.trajectories.u.copy()
+    x[1, 3, 1] = 0.5  # of x_4: the steps from knots 3 and 4 are broken
+    u[1, 6, 1] = 0.25
+    made = replace(made, trajectories=replace(made.trajectories, x=x, u=u))
+    replayed = np.zeros((2, 10, 2))
+    replayed[1, 7, 0] = 1.5
+    made = replace(made, open_loop=replace(made.open_loop, controls=replayed))
+    plan, replay = made.worst(chain=1).split("replay open loop of chain 1")
+    heading, _, *rows = plan.splitlines()
+    assert heading == "plan of chain 1: 2 of 6 entries above what is tolerated"
+    assert [row.split() for row in rows] == [
+        ["dynamics", "x1", "3", "0.3", "5.0e-01", "1.0e-03", "broken"],
+        ["inequality", "[1]", "6", "0.6", "4.0e-01", "1.0e-03", "broken"],
+    ]
+    heading, _, row = replay.splitlines()
+    assert heading == ": 1 of 4 entries above what is tolerated"
+    assert row.split()[:6] == ["control", "bounds", "u0", "7", "0.7", "5.0e-01"]
+    assert len(made.worst(chain=1, count=1).splitlines()) == 6
+    assert len(made.worst(chain=0).splitlines()) == 2  # nothing is violated
+
+
+def test_rotations_of_a_free_joint_have_names():
+    names = difference_names(robot(arm(BALL)).dynamics)
+    assert names[:4] == ["qpos_elbow", "qpos_hip_rx", "qpos_hip_ry", "qpos_hip_rz"]
+    assert names[4:] == ["qvel_elbow", "qvel_hip_wx", "qvel_hip_wy", "qvel_hip_wz"]
+
+
+def test_worst_refuses_what_is_no_chain_and_a_lost_problem(tmp_path):
+    made = made_up(point())
+    for arguments, words in (({"chain": 2}, "chain is 2"), ({"count": 0}, "count is 0")):
+        with pytest.raises(DraxError, match=words):
+            made.worst(**arguments)
+    with pytest.raises(DraxError, match="load"):
+        Solution.load(made.save(tmp_path)).worst()
 
 
 def test_a_minimum_is_shown_with_its_cost_and_what_it_breaks():
