@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import cost_file, export, pictures
-from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_nothing
-from mjx_drax.cli.progress import Bar
+from mjx_drax.cli.common import at_least_1, make, say, say_nothing
 
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
@@ -153,25 +152,23 @@ def _run(options: argparse.Namespace) -> int:
     if look or options.film is not None:
         require_drawing(problem, draw=draw, **look)
     film = None if options.film is None else pictures.film_path(options.film, folder)
-    cache_compilations()
     tell = say_nothing if options.quiet or options.json else say
 
     if options.checkpoint is not None and Path(options.checkpoint).expanduser().exists():
         tell(f"going on from {options.checkpoint}")
-    tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
-    with Bar() as bar:
-        solution = solve(
-            problem,
-            chains,
-            options.seed,
-            solver,
-            progress=None if options.quiet else bar,
-            record=1 if film else None,
-            checkpoint=options.checkpoint,
-            tolerances=tolerances,
-            **polish,
-            precision=options.precision,
-        )
+    tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains")
+    solution = solve(
+        problem,
+        chains,
+        options.seed,
+        solver,
+        progress=not options.quiet,
+        record=1 if film else None,
+        checkpoint=options.checkpoint,
+        tolerances=tolerances,
+        **polish,
+        precision=options.precision,
+    )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]
     if not options.no_video:

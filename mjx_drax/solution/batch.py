@@ -16,15 +16,16 @@ import jax
 import numpy as np
 
 from mjx_drax.base.errors import require_whole
+from mjx_drax.kernels.compilation import keep_programs
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.tracing import require_functions
 from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE, ranking
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import (
     OPEN_LOOP,
     WITH_FEEDBACK,
@@ -191,7 +192,7 @@ def solve_batch(
     seed: int = 0,
     solver: Langevin | Restarts | None = None,
     chunk: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | bool | None = None,
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
     tolerances: Tolerances | None = None,
@@ -211,7 +212,8 @@ def solve_batch(
         seed: of all random numbers; problem i gets the same ones whatever is solved beside it.
         solver: `Restarts()` by default.
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
-        progress: called with (problems done, of how many) after every chunk.
+        progress: as in `solve`; a function is called with (problems done, of how many) after every
+            chunk.
         devices: how many of this process to spread a chunk over, evenly; see `solve`.
         checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
             there, as in `solve`.
@@ -226,7 +228,8 @@ def solve_batch(
     if chunk is not None:
         require_whole("chunk", chunk)
     require_whole("chains", chains)
-    require_functions(progress=progress)
+    report = reporting(progress, "problems")
+    keep_programs()
     family = Family.of(make, values)
     family = replace(family, problem=family.problem.in_precision(precision))
     with family.problem.arithmetic():
@@ -244,9 +247,9 @@ def solve_batch(
             size=size,
             mesh=mesh_for(size, devices),
             checkpoint=file,
-            chunk_done=progress,
         )
-        found = search.run()
+        with report as search.chunk_done:
+            found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         return _certified(family, settings, chains, found, interrupted, tolerances)
 

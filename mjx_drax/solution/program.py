@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_whole, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.kernels.compilation import keep_programs
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.build import from_function
 from mjx_drax.problem.problem import Problem, checked
@@ -31,6 +32,7 @@ from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of, table
+from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
 from mjx_drax.solution.report import counts, html
 from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
@@ -201,7 +203,7 @@ def minimize(
     seed: int = 0,
     solver: Langevin | Restarts | None = None,
     guess: ArrayLike | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
     precision: int | None = None,
@@ -217,10 +219,11 @@ def minimize(
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
+    report = reporting(progress, program.name)
+    keep_programs()
     program = program.in_precision(precision)
     with program.arithmetic():
         knots = None if guess is None else _knots(guess, chains, program.dynamics.nu)
-        require_functions(progress=progress)
         settings = settled(program, chains, seed, solver, tolerance, max_iterations)
         mesh = mesh_for(chains)
         search = Search(
@@ -230,9 +233,9 @@ def minimize(
             settings,
             mesh=mesh,
             guess=knots,
-            progress=progress,
         )
-        found = search.run()
+        with report as search.progress:
+            found = search.run()
         state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
         multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
         return Minimum(
