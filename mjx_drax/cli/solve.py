@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="written every half minute; where it is there, the solve goes on from it",
     )
-    add("--no-video", action="store_true", help="leave out video.mp4 and timelapse.png")
+    add("--no-video", action="store_true", help="leave out videos and timelapse.png")
     add(
         "--film",
         nargs="?",

@@ -12,6 +12,12 @@ from mjx_drax.solution.violations import GOAL, TRACKING, words
 OPTIMA = 5
 """So many distinct optima are printed."""
 
+LOOK = (
+    "look at it     solution.worst() lists what it breaks, and mjx_drax.render(solution, "
+    '"plan.mp4", plan=True) films what was planned'
+)
+"""Where to look if nothing is certified."""
+
 LABEL = 15
 """Characters of a line that name what it is about."""
 
@@ -38,6 +44,7 @@ def lines(solution: Results) -> list[str]:
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
+        *([] if solution.certified else [LOOK]),
         solution.verdict if solution.certified else f"{solution.verdict}: {_advice(solution)}",
     ]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_drax.base.errors import DraxError, require_whole
+from mjx_drax.base.errors import require_whole
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.solution import report, worst
@@ -74,10 +74,6 @@ class Solution(Results):
         Raises:
             DraxError: it was loaded without its problem; there is no such chain.
         """
-        if chain is not None:
-            require_whole("chain", chain, 0)
-            if chain >= self.chains:
-                raise DraxError(f"chain is {chain}: give a number below {self.chains}.")
         require_whole("count", count)
         return worst.table(self, chain, count)
 

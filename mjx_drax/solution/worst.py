@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK, defects
+from mjx_drax.solution.replay import defects
 from mjx_drax.solution.results import Results
 from mjx_drax.solution.violations import (
     DYNAMICS,
@@ -50,7 +50,7 @@ def of_replay(solution: Results, chain: int) -> list[Violation]:
         DraxError: the solution was loaded without its problem.
     """
     problem, plan, _, extent = _motion(solution, chain)
-    ran = solution.replays_in(_mode(solution, chain))
+    ran = solution.replays_in(solution.mode_of(chain))
     states, u = ran.states[chain], ran.controls[chain]
     off = np.nan_to_num(problem.dynamics.host_difference(states, plan), nan=np.inf)[-1]
     found = by_entry(problem, (states, u), off, extent, solution.tolerances)
@@ -67,11 +67,10 @@ def table(solution: Results, chain: int | None = None, count: int = 10) -> str:
         chain: the best one by default.
         count: at most so many lines for the plan, and for the replay.
     """
-    chain = solution.best_chain if chain is None else chain
-    lines = []
+    chain, lines = solution.chain_or_best(chain), []
     for title, found in (
         (f"plan of chain {chain}", of_plan(solution, chain)),
-        (f"replay {_mode(solution, chain)} of chain {chain}", of_replay(solution, chain)),
+        (f"replay {solution.mode_of(chain)} of chain {chain}", of_replay(solution, chain)),
     ):
         broken, shown = sum(v.broken for v in found), [v for v in found if v.size][:count]
         lines.append(f"{title}: {broken} of {len(found)} entries above what is tolerated")
@@ -88,10 +87,6 @@ def _motion(
     u = np.asarray(solution.trajectories.u[chain])
     extent = tuple(each[0] for each in extents(solution.problem, plan[None], u[None]))
     return solution.problem, plan, u, extent
-
-
-def _mode(solution: Results, chain: int) -> str:
-    return OPEN_LOOP if solution.open_loop_is_better[chain] else WITH_FEEDBACK
 
 
 def _sorted(found: list[Violation]) -> list[Violation]:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
-from mjx_drax.cli import cost_file, main
+from mjx_drax.cli import cost_file, main, pictures
 from mjx_drax.physics.report import text
 from mjx_drax.search.engine import REPORT_EVERY
 
@@ -153,6 +153,21 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     assert "there from an earlier solve: replay.csv\n" in out
     assert not json.loads((tmp_path / "result.json").read_text())["certified"]
     assert not (tmp_path / "video.mp4").exists()
+
+
+def test_the_plan_is_filmed_too_if_nothing_is_certified(slider, tmp_path, monkeypatch):
+    films = []
+    monkeypatch.setattr(
+        "mjx_drax.view.video.render", lambda _, path, **how: films.append((path.name, how))
+    )
+    monkeypatch.setattr("mjx_drax.view.timelapse.render_timelapse", lambda *_, **__: None)
+    names = pictures.write_video(slider, tmp_path, None, {"fps": 5})
+    assert names == ["video.mp4", "timelapse.png"]
+    failed = replace(slider, max_defect=np.ones_like(slider.max_defect))
+    names = pictures.write_video(failed, tmp_path, None, {"fps": 5})
+    assert names == ["video.mp4", "plan.mp4", "timelapse.png"]
+    assert films[-1] == ("plan.mp4", {"draw": None, "plan": True, "fps": 5})
+    assert set(names) < set(pictures.NAMES)
 
 
 def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):

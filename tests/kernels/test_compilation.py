@@ -86,3 +86,15 @@ def test_what_the_user_says_about_the_cache_of_jax_holds(tmp_path, setting, valu
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     (tmp_path / "mjx_drax").touch()
     assert files_kept(tmp_path) == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "given", "level"),
+    [("", None, "3"), ("", "0", "0"), ("", "1", "1"), ("import jax\n", None, "3")],
+)
+def test_the_log_of_xla_is_off_unless_the_user_turns_it_on(before, given, level):
+    name = "TF_CPP_MIN_LOG_LEVEL"
+    env = {k: v for k, v in os.environ.items() if k != name} | ({name: given} if given else {})
+    code = f"{before}import mjx_drax, os; print(os.environ[{name!r}])"
+    done = subprocess.run([sys.executable, "-c", code], env=env, check=True, stdout=subprocess.PIPE)
+    assert done.stdout.decode().strip() == level

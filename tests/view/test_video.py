@@ -257,6 +257,35 @@ def test_overlay_says_what_is_certified(
         assert lines[-1] == "t = {time}"
 
 
+def test_the_plan_of_any_chain_can_be_filmed(pendulum: Solution, tmp_path: Path) -> None:
+    x = pendulum.trajectories.x.copy()
+    x[1, 2:] += 1.0
+    failed = replace(
+        pendulum,
+        trajectories=replace(pendulum.trajectories, x=x),
+        max_defect=np.array([1e-6, *np.ones(len(x) - 1)]),
+    )
+    seen: list[np.ndarray] = []
+
+    def draw(axes: Axes, states: np.ndarray) -> None:
+        seen.append(states)
+
+    path = tmp_path / "plan.mp4"
+    video.render(failed, path, fps=2, size=(320, 240), draw=draw, chain=1, plan=True)
+    np.testing.assert_allclose(seen[-1], failed.plans[1], rtol=1e-6)
+    video.render(failed, path, fps=2, size=(320, 240), draw=draw, chain=1)
+    replayed = failed.replays_in(failed.mode_of(1)).states[1]
+    np.testing.assert_array_equal(seen[-1], replayed)
+    lines = video.outcome_lines(failed, 1, plan=True)
+    assert lines[1] == "NOT CERTIFIED: the plan is infeasible"
+    assert "PLAN of chain 1, not a replay:" in lines
+    assert "breaks the dynamics in x" in " ".join(lines)
+    assert "at knot 2," in " ".join(lines)
+    assert "keeps to the dynamics" in video.outcome_lines(failed, 0, plan=True)
+    with pytest.raises(DraxError, match=f"chain is 99: give a number below {len(x)}"):
+        video.render(failed, path, draw=draw, chain=99)
+
+
 def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) -> None:
     first = []
     for success in (True, False):
