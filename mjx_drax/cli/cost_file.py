@@ -6,7 +6,7 @@ import difflib
 import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import TYPE_CHECKING
 
 from mjx_drax.base.errors import DraxError, reason
@@ -73,7 +73,8 @@ def _require_no_slips(module: ModuleType, known: set[str], cost: str) -> None:
     """
     missing = sorted(known - set(vars(module)))
     for name, value in vars(module).items():
-        imported = getattr(value, "__module__", module.__name__) != module.__name__
+        defined = isinstance(value, FunctionType | BuiltinFunctionType | type)
+        imported = defined and value.__module__ != module.__name__
         if name.startswith("_") or name in known or imported or isinstance(value, ModuleType):
             continue
         alike = FUNCTION_ALIKE if callable(value) else VALUE_ALIKE
