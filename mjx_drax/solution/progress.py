@@ -90,8 +90,9 @@ class Bar:
         bar = self._bar
         if not self._compiled.is_set():
             self._stop_clock()
-            bar.bar_format, bar.initial = FORMAT, done
+            bar.bar_format = FORMAT
             bar.reset(total)
+            bar.initial = done
         if info is not None:
             feasible = np.asarray(info.max_defect) < FEASIBLE
             self._best = np.asarray(info.cost)[feasible].min(initial=self._best)

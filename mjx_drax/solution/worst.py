@@ -68,9 +68,11 @@ def table(solution: Results, chain: int | None = None, count: int = 10) -> str:
         count: at most so many lines for the plan, and for the replay.
     """
     chain, lines = solution.chain_or_best(chain), []
+    mode = solution.mode_of(chain)
+    outcome = solution.replays_in(mode).outcome(solution.problem, chain)
     for title, found in (
         (f"plan of chain {chain}", of_plan(solution, chain)),
-        (f"replay {solution.mode_of(chain)} of chain {chain}", of_replay(solution, chain)),
+        (f"replay {mode} of chain {chain}, which {outcome}", of_replay(solution, chain)),
     ):
         broken, shown = sum(v.broken for v in found), [v for v in found if v.size][:count]
         lines.append(f"{title}: {broken} of {len(found)} entries above what is tolerated")
