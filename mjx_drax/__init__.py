@@ -7,8 +7,18 @@
 Names are loaded when they are first used, so that importing the package costs nothing.
 """
 
+import os
+import sys
+
 import lazy_loader
 
 from mjx_drax import _checkout as _checkout
+
+# XLA logs alarms about slow compiles and other machines' programs, as errors; what fails raises an
+# exception all the same. JAX itself says 1 where the user says nothing.
+if "TF_CPP_MIN_LOG_LEVEL" not in os.environ or (
+    "jax" in sys.modules and os.environ["TF_CPP_MIN_LOG_LEVEL"] == "1"
+):
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 
-from mjx_drax.cli.common import cache_compilations, say
+from mjx_drax.cli.common import say
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,9 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Check the model; progress goes to standard error."""
+    from mjx_drax.kernels.compilation import keep_programs
     from mjx_drax.physics.report import check, text
 
-    cache_compilations()
+    keep_programs()
     report = check(options.model, lambda line: print(line, file=sys.stderr, flush=True))
     say(json.dumps(report, indent=1) if options.json else text(report))
     return 0 if report["obstacle"] is None else 1

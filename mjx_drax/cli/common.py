@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -35,13 +33,3 @@ def make(task: ModuleType, horizon: float | None) -> Problem:
     """A task's problem, over its own horizon or one of so many seconds."""
     problem: Problem = task.make() if horizon is None else task.make(horizon=horizon)
     return problem
-
-
-def cache_compilations() -> None:
-    """Keep compiled programs between runs, so that a second run starts at once."""
-    import jax
-
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "mjx_drax" / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # dozens of small ones

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import TYPE_CHECKING
 
 from mjx_drax.base.errors import DraxError, reason
@@ -18,19 +19,30 @@ HELP = """\
 A cost file is Python. It defines at least one of
   running_cost(data, u), terminal_cost(data)           scalars
   running_residual(data, u), terminal_residual(data)   vectors: adds half the squared norm
-on mjx.Data (qpos, qvel, site_xpos, sensordata, ...), and may define
+on mjx.Data (qpos, qvel, data.site("tip").xpos, data.sensor("touch").data, ...), where any
+function may have a parameter `knot` besides (time, index, dt, data, parameters), and may define
   goal(data) -> bool       what a replay in MuJoCo must reach
   equality(data, u), terminal_equality(data)       vectors held at 0
   inequality(data, u), terminal_inequality(data)   vectors held <= 0
-  horizon, dt              [s]
-  x_init                   [qpos, qvel, act]
+  horizon, dt              [s]; horizon = (least, most) with knots = K leaves it open
+  x_init, x_init_bounds    [qpos, qvel, act], and how far it may be chosen
   x_bounds, u_bounds       (lower, upper)
   x_scatter, u_scatter     (lower, upper): where initial knots are drawn
+  parameters               {name: (lower, upper)}, chosen once for the whole motion, and
+  model_numbers(model, p)  fields of the model that depend on them
+  rates, rate_bounds       1: functions read knot.rate, 2: knot.jerk; (lower, upper) of the rate
+  u_init                   the control before the first knot
+  data                     arrays with a row for each knot, or data(t); functions read knot.data
   guess(key) -> Trajectory initial knots of one chain
   contacts                 how many contact points the plan keeps, the nearest ones; False: none
   derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin
+Other names are yours, but for those that are nearly one of these: they are taken for slips.
 """
+
+FUNCTION_ALIKE, VALUE_ALIKE = 0.77, 0.9
+"""How much of a name has to be that of a known one to be taken for a slip: `final_cost` is one,
+the numbers `u_init` and `x_goal` are not."""
 
 
 def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restarts]:
@@ -39,7 +51,8 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restart
     The file may define every argument of `from_mjcf` by its name.
 
     Raises:
-        DraxError: the file is missing, fails, or misses something; or the problem cannot be built.
+        DraxError: the file is missing, fails, misses something, or defines what is nearly one of
+            the known names; or the problem cannot be built.
     """
     from inspect import signature
 
@@ -48,6 +61,7 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restart
 
     module = _module(Path(cost))
     names = set(signature(from_mjcf).parameters) - {"model", "name"}
+    _require_no_slips(module, {*names, "solver"}, cost)
     given = {name: value for name, value in vars(module).items() if name in names}
     if horizon is not None:
         given["horizon"] = horizon
@@ -55,6 +69,26 @@ def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restart
         raise DraxError(f"no horizon: define it in {cost} or give --horizon SECONDS.")
     problem = from_mjcf(model, name=Path(model).stem, **given)
     return problem, as_restarts(getattr(module, "solver", None))
+
+
+def _require_no_slips(module: ModuleType, known: set[str], cost: str) -> None:
+    """Complain about a definition that would be ignored, and whose name is nearly a known one.
+
+    What is imported does not count, nor what begins with an underscore, nor a name whose known one
+    is defined as well: that is a helper's.
+    """
+    missing = sorted(known - set(vars(module)))
+    for name, value in vars(module).items():
+        defined = isinstance(value, FunctionType | BuiltinFunctionType | type)
+        imported = defined and value.__module__ != module.__name__
+        if name.startswith("_") or name in known or imported or isinstance(value, ModuleType):
+            continue
+        alike = FUNCTION_ALIKE if callable(value) else VALUE_ALIKE
+        for meant in difflib.get_close_matches(name.lower(), missing, 1, alike):
+            raise DraxError(
+                f"{cost} defines {name}, which is not a known name: rename it to {meant}, or to "
+                f"_{name} if it is something else."
+            )
 
 
 def _module(path: Path) -> ModuleType:

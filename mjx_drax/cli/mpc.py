@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_drax.base.errors import require_not_negative
-from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_nothing
+from mjx_drax.cli.common import at_least_1, make, say, say_nothing
 
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "chains": (at_least_1, 8, "number of chains; default 8"),
@@ -72,7 +72,6 @@ def run(options: argparse.Namespace) -> int:
         require_drawing(problem)
     folder = writable(options.out or Path("out") / f"mpc_{problem.name}")
     tell = say_nothing if options.json else say
-    cache_compilations()
     tell(f"{problem.name}: K = {problem.horizon} knots, {options.chains} chains; compiling ...")
     policy.reset(problem.x_init)
     tell(f"first solve and compilation took {policy.first_solve:.1f} s")

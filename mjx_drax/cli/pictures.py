@@ -14,6 +14,7 @@ NAMES = (
     "phase.png",
     "optima.png",
     "video.mp4",
+    "plan.mp4",
     "timelapse.png",
     "film.mp4",
 )
@@ -48,7 +49,7 @@ def write_plots(solution: Solution, folder: Path, draw: Any) -> list[str]:
 
 
 def write_video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any]) -> list[str]:
-    """The motion as a video, and in one picture; returns the files' names."""
+    """The motion as a video, the plan too if it failed, and a picture; returns the files' names."""
     from mjx_drax.physics.dynamics import mujoco_model
     from mjx_drax.view.timelapse import render_timelapse
     from mjx_drax.view.video import render
@@ -57,8 +58,12 @@ def write_video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any
     if model is None and draw is None:
         return []
     render(solution, folder / "video.mp4", draw=draw, **look)
+    written = ["video.mp4"]
+    if not solution.certified:
+        render(solution, folder / "plan.mp4", draw=draw, plan=True, **look)
+        written.append("plan.mp4")
     if model is None:
-        return ["video.mp4"]
+        return written
     still = {name: look[name] for name in ("camera", "size") if name in look}
     render_timelapse(solution, folder / "timelapse.png", **still)
-    return ["video.mp4", "timelapse.png"]
+    return [*written, "timelapse.png"]

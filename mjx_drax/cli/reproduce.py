@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from mjx_drax.cli.common import at_least_1, cache_compilations, say
+from mjx_drax.cli.common import at_least_1, say
 from mjx_drax.studies import reproduce
 
 
@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Make the figure, and print its table."""
-    cache_compilations()
+    from mjx_drax.kernels.compilation import keep_programs
+
+    keep_programs()
     numbers = reproduce.run(options.name, options.out, options.chains, options.iterations)
     from mjx_drax.studies.reproduce.output import table
 

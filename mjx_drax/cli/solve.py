@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import cost_file, export, pictures
-from mjx_drax.cli.common import at_least_1, cache_compilations, make, say, say_nothing
-from mjx_drax.cli.progress import Bar
+from mjx_drax.cli.common import at_least_1, make, say, say_nothing
 
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
@@ -50,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="written every half minute; where it is there, the solve goes on from it",
     )
-    add("--no-video", action="store_true", help="leave out video.mp4 and timelapse.png")
+    add("--no-video", action="store_true", help="leave out videos and timelapse.png")
     add(
         "--film",
         nargs="?",
@@ -109,18 +108,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--log",
         action="store_true",
-        help="also print cost, max|h| and residual by iteration; plot.png draws them",
+        help="also print cost, max|h| and residual by iteration, which plot.png draws, and the "
+        "worst violations by name and knot",
     )
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
 
 def _size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT as (height, width)."""
+    """WIDTHxHEIGHT as (width, height)."""
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit()):
         raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT, such as 640x480")
-    return int(height), int(width)
+    return int(width), int(height)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -134,7 +134,6 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     """The same, in the precision that JAX has now."""
     problem, solver, chains, draw = _asked(options)
-    from mjx_drax.cli import summary
     from mjx_drax.search.restarts import settled
     from mjx_drax.solution import save as results
     from mjx_drax.solution.solve import solve
@@ -153,25 +152,23 @@ def _run(options: argparse.Namespace) -> int:
     if look or options.film is not None:
         require_drawing(problem, draw=draw, **look)
     film = None if options.film is None else pictures.film_path(options.film, folder)
-    cache_compilations()
     tell = say_nothing if options.quiet or options.json else say
 
     if options.checkpoint is not None and Path(options.checkpoint).expanduser().exists():
         tell(f"going on from {options.checkpoint}")
-    tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains; compiling ...")
-    with Bar() as bar:
-        solution = solve(
-            problem,
-            chains,
-            options.seed,
-            solver,
-            progress=None if options.quiet else bar,
-            record=1 if film else None,
-            checkpoint=options.checkpoint,
-            tolerances=tolerances,
-            **polish,
-            precision=options.precision,
-        )
+    tell(f"{problem.name}: K = {problem.horizon} knots, {chains} chains")
+    solution = solve(
+        problem,
+        chains,
+        options.seed,
+        solver,
+        progress=not options.quiet,
+        record=1 if film else None,
+        checkpoint=options.checkpoint,
+        tolerances=tolerances,
+        **polish,
+        precision=options.precision,
+    )
     results.save(solution, folder)
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]
     if not options.no_video:
@@ -183,8 +180,8 @@ def _run(options: argparse.Namespace) -> int:
     written += export.write(solution, folder, wanted, tell)
     if options.log:
         tell(solution.log())
-    for line in summary.lines(solution):
-        tell(line)
+        tell(solution.worst())
+    tell(str(solution))
     tell(f"written to {folder}/: {', '.join(written)}")
     if film is not None:
         tell(f"film written to {film}")

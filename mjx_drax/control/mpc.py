@@ -44,7 +44,7 @@ from mjx_drax.base.errors import (
 from mjx_drax.base.numbers import numbers
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.control.shift import shifted
-from mjx_drax.kernels.compilation import compiled
+from mjx_drax.kernels.compilation import compiled, keep_programs
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
@@ -186,6 +186,7 @@ class MPC:
             DraxError: a setting that cannot work, named with its value and the fix.
         """
         problem = checked(problem)
+        keep_programs()
         require_whole("chains", chains)
         explorers = chains // 2 if explorers is None else explorers
         for name, count, least in (

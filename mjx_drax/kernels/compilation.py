@@ -1,12 +1,15 @@
-"""How the programs that a solve waits for are compiled."""
+"""How the programs that a solve waits for are compiled, and where they are kept."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cached_property, lru_cache, update_wrapper
+from pathlib import Path
 from typing import Any
 
 import jax
+from jax.experimental.compilation_cache import compilation_cache
 
 GPU_OPTIONS = {"xla_gpu_experimental_enable_fusion_autotuner": False}
 """XLA would try several ways to compile each fusion, on the GPU: up to two thirds of the time that
@@ -23,6 +26,34 @@ def _options() -> dict[str, bool] | None:
     except jax.errors.JaxRuntimeError:
         return None
     return GPU_OPTIONS
+
+
+def keep_programs() -> None:
+    """Keep compiled programs on disk from now on, so that a second process starts at once.
+
+    They go to `mjx_drax/jax` in the user's folder for caches. Nothing is changed where JAX was told
+    another folder, or to keep none (`jax_enable_compilation_cache`), or where none can be written.
+    """
+    known = jax.config.values
+    if known["jax_compilation_cache_dir"] or not known["jax_enable_compilation_cache"]:
+        return
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(caches) / "mjx_drax" / "jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(folder, os.W_OK):
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # dozens of small ones
+    compilation_cache.reset_cache()  # else what was compiled before settles that there is none
+
+
+def keep_none() -> None:
+    """Keep no programs, for measurements of compile times, unless JAX was told a folder."""
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_enable_compilation_cache", False)
 
 
 class compiled:

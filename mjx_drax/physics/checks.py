@@ -1,7 +1,8 @@
 """Whether a model can be planned with: all that is asked of it before a problem is built.
 
-`checked_start` asks what needs no MJX; `require_traceable` whether MJX can step the model;
-`require_same_step` and `warn_of_lost_contacts` whether its steps are those of MuJoCo's C engine.
+`checked_start` asks what needs no MJX, and `warn_of_start_beyond_limits` tells what may be a slip;
+`require_traceable` whether MJX can step the model; `require_same_step` and `warn_of_lost_contacts`
+whether its steps are those of MuJoCo's C engine.
 For this, both engines take one step in float64 from the same states. What differs by more than
 rounding is wrong in every plan, and the certificate would find that only after a solve.
 """
@@ -24,7 +25,7 @@ from mjx_drax.base.numbers import vector
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics.actuators import control_ranges, disabled
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, differences, free_ranges, put_model
 from mjx_drax.physics.states import Engine, integrate, quiet, set_state
 
@@ -36,6 +37,9 @@ WRONG, NOTICEABLE = 1e-2, 1e-6
 
 MOMENTS = (0.05, 0.2, 0.6)
 """Times [s] of the states that the engines are compared at, along a motion from x_init."""
+
+BEYOND = 0.01
+"""Share of a joint's range by which x_init may lie beyond it unsaid: limits give way a little."""
 
 SHIFT, SPEED = 0.02, 0.5
 """Standard deviations of positions [rad, m] and velocities about x_init, for one more state."""
@@ -138,6 +142,28 @@ def require_traceable(
             f"MJX fails in a step of {name} ({reason(error)}): leave out sensors, tendons and "
             "equality constraints, by which it may fail, until it does not."
         ) from error
+
+
+def warn_of_start_beyond_limits(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> None:
+    """Warn where x_init (nx,) lies outside of the range of a hinge or slide.
+
+    It can be planned from, since the limit's force pushes back, but is hardly ever what is meant.
+    """
+    single = np.isin(model.jnt_type, (SLIDE, HINGE)) & (model.jnt_limited != 0)
+    position, (low, high) = x_init[model.jnt_qposadr], model.jnt_range.T
+    beyond = np.maximum(low - position, position - high)
+    found = [
+        f"{model.joint(j).name or j} is at {position[j]:.4g}, its range is {low[j]:.4g} to "
+        f"{high[j]:.4g} {'rad' if model.jnt_type[j] == HINGE else 'm'}"
+        for j in np.flatnonzero(single & (beyond > BEYOND * (high - low)))
+    ]
+    if found:
+        warnings.warn(
+            f"x_init of {name} lies outside of the range of joints ({'; '.join(found)}): move it "
+            "inside, or widen the range.",
+            DraxWarning,
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True)

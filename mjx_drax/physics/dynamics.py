@@ -28,6 +28,7 @@ from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
+from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.physics.states import difference, integrate, set_state
 from mjx_drax.physics.stepper import Stepper
@@ -229,10 +230,11 @@ class MjxDynamics(Dynamics):
         object.__setattr__(new, "structure", Structure.of(self.model, frozenset(names)))
         return new
 
-    def observe(self, x: Array, u: Array) -> mjx.Data:
+    def observe(self, x: Array, u: Array) -> Observed:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
         data = _observe(self.model, self.structure, x, u)
-        return data if self.time is None else data.replace(time=self.time)
+        data = data if self.time is None else data.replace(time=self.time)
+        return Observed.of(self.model, data)
 
     @property
     def kinked(self) -> bool:  # type: ignore[override]
@@ -284,7 +286,7 @@ class MjxDynamics(Dynamics):
         u: np.ndarray,
         gains: np.ndarray,
         limits: tuple[np.ndarray, np.ndarray],
-        knots: Knot,
+        knots: Knot | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`.
 

@@ -19,6 +19,7 @@ from mjx_drax.physics.checks import (
     require_same_step,
     require_traceable,
     warn_of_lost_contacts,
+    warn_of_start_beyond_limits,
 )
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
@@ -68,9 +69,11 @@ def from_mjcf(
     """A problem whose dynamics are those of a MuJoCo model.
 
     Costs see `mjx.Data` after `mjx.forward` (qpos, qvel, site and body positions, sensors, ...);
-    what they do not read is not computed; `data.time` is that of the knot [s]. A parameter `knot`
-    besides receives the `Knot`: its time, its number and its data. Joint ranges and control ranges
-    of the model become bounds, which are intersected with `x_bounds` and `u_bounds`.
+    what they do not read is not computed; `data.time` is that of the knot [s]. As in
+    `mujoco.MjData`, `data.site("tip").xpos` is read by name, and so is what bodies, geoms, joints,
+    sensors, ... have, in the same shapes. A parameter `knot` besides receives the `Knot`: its time,
+    its number and its data. Joint ranges and control ranges of the model become bounds, which are
+    intersected with `x_bounds` and `u_bounds`.
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
@@ -124,7 +127,8 @@ def from_mjcf(
             function computes something else when it is traced again.
 
     Warns:
-        DraxWarning: MJX computes the model a little differently from the C engine.
+        DraxWarning: MJX computes the model a little differently from the C engine; x_init lies
+            outside of a joint's range; more contacts act at x_init than the plan keeps.
     """
     given = {
         "running_cost": running_cost,
@@ -147,6 +151,7 @@ def from_mjcf(
     phases = phases_of(horizon, knots)
     K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
     x0, bounded = checked_start(mj_model, name, x_init)
+    warn_of_start_beyond_limits(mj_model, name, x0)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
     require_traceable(mj_model, name, dynamics.observe)

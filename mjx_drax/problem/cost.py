@@ -93,7 +93,8 @@ def in_float64(function: Any) -> Any:
         return in_float64(part) if isinstance(part, Partial) else part
 
     arguments = jax.tree.map(own, function.args, is_leaf=lambda part: isinstance(part, Partial))
-    ours = function.func.__module__.startswith("mjx_drax.problem.")  # wrappers, without constants
+    module = getattr(function.func, "__module__", None) or ""
+    ours = module.startswith("mjx_drax.problem.")  # wrappers, without constants
     func = function.func if ours else untraced(function.func)
     return Partial(func, *arguments, **function.keywords)
 

@@ -107,8 +107,9 @@ def spread(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Calla
 
 def _cached() -> bool:
     """Whether devices find in JAX's persistent cache what another one compiled: GPUs do."""
-    kept = jax.config.values["jax_compilation_cache_dir"] is not None
-    return kept and jax.default_backend() == "gpu"  # keys of CPUs' programs hold the device
+    known = jax.config.values
+    kept = known["jax_compilation_cache_dir"] and known["jax_enable_compilation_cache"]
+    return bool(kept) and jax.default_backend() == "gpu"  # keys of CPUs' programs hold the device
 
 
 def gathered(tree: Tree, mesh: Mesh | None) -> Tree:

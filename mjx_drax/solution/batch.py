@@ -16,9 +16,9 @@ import jax
 import numpy as np
 
 from mjx_drax.base.errors import require_whole
+from mjx_drax.kernels.compilation import keep_programs
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.tracing import require_functions
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
@@ -26,6 +26,7 @@ from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE, ranking
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import (
     OPEN_LOOP,
     WITH_FEEDBACK,
@@ -35,18 +36,22 @@ from mjx_drax.solution.replay import (
     open_loop_is_better,
     plan_violations,
 )
+from mjx_drax.solution.report import counts, html
 from mjx_drax.solution.results import statuses, tolerance_of
 from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
 
+FEW = 10
+"""So many problems that are not certified are printed by number."""
+
 COPIES = 40
 """Numbers that a knot needs, as a multiple of (ndx + nu)^2: derivatives, factors, step sizes. XLA
 plans with 7 to 8 for the cart-pole and the acrobot on a CPU; the rest is for what was not tried."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BatchSolution:
     """The best chain of every problem, certified.
 
@@ -63,6 +68,8 @@ class BatchSolution:
         tolerances: of violations of replays.
         open_loop, feedback: replays of the best chains, over problems.
         compile_time, solve_time, replay_time: [s].
+
+    `print(batch)` shows how many problems are certified and optimal, and what they cost.
     """
 
     family: Family
@@ -81,6 +88,38 @@ class BatchSolution:
     compile_time: float
     solve_time: float
     replay_time: float
+
+    def __repr__(self) -> str:
+        return f"<BatchSolution of {self.family.problem.name}: {self._verdict}>"
+
+    def __str__(self) -> str:
+        return "\n".join(self._report())
+
+    def _repr_html_(self) -> str:
+        return html(self._report(), bool(self.certified.all()))
+
+    @property
+    def _verdict(self) -> str:
+        certified, optimal = (int(which.sum()) for which in (self.certified, self.optimal))
+        return f"{certified} of {len(self.best)} problems CERTIFIED, {optimal} of them optimal"
+
+    def _report(self) -> list[str]:
+        cost = self.cost[self.certified]
+        low, middle, high = np.quantile(cost, (0, 0.5, 1)) if cost.size else [np.nan] * 3
+        said = [
+            f"problems       {len(self.best)} of {self.chain_cost.shape[1]} chains each: "
+            f"{counts(self.status)}",
+            f"cost           {low:.5g} to {high:.5g}, median {middle:.5g}, of certified replays",
+            f"engine         {self.family.problem.dynamics.engine}",
+            f"time           compile {self.compile_time:.1f} s, solve {self.solve_time:.1f} s, "
+            f"replay {self.replay_time:.1f} s",
+        ]
+        missed = np.flatnonzero(~self.certified)
+        if missed.size:
+            more = ", ..." if missed.size > FEW else ""
+            numbers = ", ".join(map(str, missed[:FEW].tolist()))
+            said.append(f"not certified  problems {numbers}{more}; where(i) says what i breaks")
+        return [*said, self._verdict]
 
     @property
     def cost(self) -> np.ndarray:
@@ -154,7 +193,7 @@ def solve_batch(
     seed: int = 0,
     solver: Langevin | Restarts | None = None,
     chunk: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | bool | None = None,
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
     tolerances: Tolerances | None = None,
@@ -174,7 +213,8 @@ def solve_batch(
         seed: of all random numbers; problem i gets the same ones whatever is solved beside it.
         solver: `Restarts()` by default.
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
-        progress: called with (problems done, of how many) after every chunk.
+        progress: as in `solve`; a function is called with (problems done, of how many) after every
+            chunk.
         devices: how many of this process to spread a chunk over, evenly; see `solve`.
         checkpoint: a file to write every half minute, after a chunk, and to go on from where it is
             there, as in `solve`.
@@ -189,7 +229,8 @@ def solve_batch(
     if chunk is not None:
         require_whole("chunk", chunk)
     require_whole("chains", chains)
-    require_functions(progress=progress)
+    report = reporting(progress, "problems")
+    keep_programs()
     family = Family.of(make, values)
     family = replace(family, problem=family.problem.in_precision(precision))
     with family.problem.arithmetic():
@@ -207,9 +248,9 @@ def solve_batch(
             size=size,
             mesh=mesh_for(size, devices),
             checkpoint=file,
-            chunk_done=progress,
         )
-        found = search.run()
+        with report as search.chunk_done:
+            found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         return _certified(family, settings, chains, found, interrupted, tolerances)
 

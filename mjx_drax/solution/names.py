@@ -15,6 +15,10 @@ _POSITIONS = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
     int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
 }
+_ROTATIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "rx", "ry", "rz"),
+    int(mujoco.mjtJoint.mjJNT_BALL): ("rx", "ry", "rz"),
+}
 _VELOCITIES = {
     int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
     int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
@@ -42,9 +46,8 @@ def state_names(dynamics: Dynamics) -> list[str]:
 
 
 def _further_names(dynamics: Extended) -> list[str]:
-    inner, own = state_names(dynamics.inner), []
-    vector = dynamics.inner.nx == dynamics.inner.ndx
-    own += [f"start_{inner[i] if vector else i}" for i in dynamics.free]
+    inner = difference_names(dynamics.inner)
+    own = [f"start_{inner[i]}" for i in dynamics.free]
     for name, shape in dynamics.shapes:
         places = np.ndindex(*shape)
         own += ["_".join([name, *map(str, place)]) for place in places]
@@ -52,6 +55,25 @@ def _further_names(dynamics: Extended) -> list[str]:
     own += ["step"] if phases == 1 else [f"step_{i}" for i in range(phases)]
     controls = control_names(dynamics.inner)
     return own + [f"before{i or ''}_{u}" for i in range(dynamics.order) for u in controls]
+
+
+def difference_names(dynamics: Dynamics) -> list[str]:
+    """Names of the entries of a difference of states, ndx of them.
+
+    Those of the state, but for the rotation vectors of ball and free joints, _rx, _ry, _rz.
+    """
+    if dynamics.nx == dynamics.ndx:
+        return state_names(dynamics)
+    if isinstance(dynamics, Extended):
+        return [*difference_names(dynamics.inner), *_further_names(dynamics)]
+    model = mujoco_model(dynamics)
+    if model is None:
+        return [f"coordinate {i}" for i in range(dynamics.ndx)]
+    return [
+        *_joint_names(model, "qpos", _ROTATIONS),
+        *_joint_names(model, "qvel", _VELOCITIES),
+        *_activation_names(model),
+    ]
 
 
 def control_names(dynamics: Dynamics) -> list[str]:

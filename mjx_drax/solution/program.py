@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_whole, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.kernels.compilation import keep_programs
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.build import from_function
 from mjx_drax.problem.problem import Problem, checked
@@ -31,8 +32,10 @@ from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of, table
+from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
-from mjx_drax.solution.results import endings, stalled_of, statuses, tolerance_of
+from mjx_drax.solution.report import counts, html
+from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
 from mjx_drax.solution.violations import Violation
 
 
@@ -84,7 +87,7 @@ def from_program(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Minimum:
     """Where the chains of a nonlinear program ended. Arrays are numpy's.
 
@@ -101,6 +104,8 @@ class Minimum:
         died_at: iteration at which a chain turned non-finite and was frozen, else -1, (chains,).
         interrupted: whether the solve was ended before its time.
         history: of all chains by iteration; see `Solution`.
+
+    `print(minimum)` shows how many chains are optimal, and the best one.
     """
 
     program: Problem
@@ -115,6 +120,32 @@ class Minimum:
     died_at: np.ndarray
     interrupted: bool
     history: dict[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        return f"<Minimum of {self.program.name}: {len(self.cost)} chains, {self._verdict}>"
+
+    def __str__(self) -> str:
+        return "\n".join(self._report())
+
+    def _repr_html_(self) -> str:
+        return html(self._report(), self.optimal)
+
+    @property
+    def _verdict(self) -> str:
+        """What is known of the best chain, with its cost."""
+        return f"{self.status[self.best_chain]}, cost {self.cost[self.best_chain]:.5g}"
+
+    def _report(self) -> list[str]:
+        best, where = self.best_chain, self.where(self.best_chain)
+        broken = "" if where is None else f": {where.told(self.program)}"
+        found = optimality(float(self.residual[best]), self.tolerance, self.polished[best])
+        return [
+            f"chains         {len(self.cost)}: {counts(self.status)}",
+            f"best           cost {self.cost[best]:.5g}, max|h| {self.max_defect[best]:.1e}",
+            f"optimality     {found}",
+            f"x              {shown([float(f'{x:.6g}') for x in self.best], 160)}",
+            f"{self.status[best]}{broken}",
+        ]
 
     def log(self) -> str:
         """The history as a table, a line for each report; see `Solution.log`."""
@@ -172,7 +203,7 @@ def minimize(
     seed: int = 0,
     solver: Langevin | Restarts | None = None,
     guess: ArrayLike | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
     precision: int | None = None,
@@ -188,10 +219,11 @@ def minimize(
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
+    report = reporting(progress, program.name)
+    keep_programs()
     program = program.in_precision(precision)
     with program.arithmetic():
         knots = None if guess is None else _knots(guess, chains, program.dynamics.nu)
-        require_functions(progress=progress)
         settings = settled(program, chains, seed, solver, tolerance, max_iterations)
         mesh = mesh_for(chains)
         search = Search(
@@ -201,9 +233,9 @@ def minimize(
             settings,
             mesh=mesh,
             guess=knots,
-            progress=progress,
         )
-        found = search.run()
+        with report as search.progress:
+            found = search.run()
         state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
         multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
         return Minimum(

@@ -204,7 +204,14 @@ def plan_violations(family: Family, plan: np.ndarray, u: np.ndarray) -> Violatio
 
 
 def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violation:
-    """Where one plan breaks the dynamics most: each knot's step, taken again from its own state.
+    """Where one plan breaks the dynamics most; see `defects`."""
+    off = defects(problem, plan, u)
+    knot, entry = np.unravel_index(int(off.argmax()), off.shape)
+    return Violation(DYNAMICS, float(off[knot, entry]), FEASIBLE, int(entry), int(knot))
+
+
+def defects(problem: Problem, plan: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """|f(x_k, u_k) - x_{k+1}| of one plan, (K, ndx): each knot's step, from its own state.
 
     Args:
         problem: for its engine.
@@ -221,6 +228,4 @@ def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violati
         given = np.asarray(u, float)[:, None]
         ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
     off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
-    off = np.nan_to_num(off, nan=np.inf)
-    knot, entry = np.unravel_index(int(off.argmax()), off.shape)
-    return Violation(DYNAMICS, float(off[knot, entry]), FEASIBLE, int(entry), int(knot))
+    return np.nan_to_num(off, nan=np.inf)

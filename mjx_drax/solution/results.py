@@ -19,7 +19,7 @@ from functools import cached_property
 import jax
 import numpy as np
 
-from mjx_drax.base.errors import DraxError, require_positive
+from mjx_drax.base.errors import DraxError, require_positive, require_whole
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Multipliers
 from mjx_drax.polish.interior_point import Progress as PolishProgress
@@ -231,6 +231,19 @@ class Results:
                 return int(np.argmin(np.where(eligible, cost, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
 
+    def chain_or_best(self, chain: int | None) -> int:
+        """The chain's number, and the best one's for None.
+
+        Raises:
+            DraxError: there is no such chain.
+        """
+        if chain is None:
+            return self.best_chain
+        require_whole("chain", chain, 0)
+        if chain >= self.chains:
+            raise DraxError(f"chain is {chain}: give a number below {self.chains}.")
+        return chain
+
     def where(self, chain: int) -> Violation | None:
         """What keeps a chain's plan from being feasible: the largest defect or constraint.
 
@@ -254,11 +267,15 @@ class Results:
         """The best chain's knots x_1..x_K (K, nx) and u_0..u_{K-1} (K, nu)."""
         return jax.tree.map(lambda a: a[self.best_chain], self.trajectories)
 
-    @cached_property
+    def times_of(self, chain: int) -> np.ndarray:
+        """Times of x_0..x_K of a chain, (K + 1,) [s]."""
+        problem = self.problem
+        return problem.dynamics.times(self.plans[chain], float(problem.t_init))
+
+    @property
     def times(self) -> np.ndarray:
         """Times of x_0..x_K of the best chain, (K + 1,) [s]."""
-        problem = self.problem
-        return problem.dynamics.times(self.plans[self.best_chain], float(problem.t_init))
+        return self.times_of(self.best_chain)
 
     @cached_property
     def parameters(self) -> dict[str, np.ndarray]:
@@ -299,7 +316,11 @@ class Results:
     @property
     def replay_mode(self) -> str:
         """Which replay speaks for the best chain: the one that succeeds, then the cheaper."""
-        return OPEN_LOOP if self.open_loop_is_better[self.best_chain] else WITH_FEEDBACK
+        return self.mode_of(self.best_chain)
+
+    def mode_of(self, chain: int) -> str:
+        """Which replay speaks for a chain."""
+        return OPEN_LOOP if self.open_loop_is_better[chain] else WITH_FEEDBACK
 
     def replays_in(self, mode: str) -> Replays:
         """The replays of all chains in a mode."""

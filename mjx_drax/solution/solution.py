@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mjx_drax.base.errors import require_whole
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
+from mjx_drax.solution import report, worst
 from mjx_drax.solution.load import load
 from mjx_drax.solution.replay import both_ways
 from mjx_drax.solution.results import Results
@@ -18,7 +20,20 @@ from mjx_drax.solution.violations import Tolerances, as_tolerances
 
 
 class Solution(Results):
-    """All chains of a solve, what they reached, and how they replay; see `Results`."""
+    """All chains of a solve, what they reached, and how they replay; see `Results`.
+
+    `print(solution)` shows the report that `mjx-drax solve` ends with, and a notebook the same as a
+    table.
+    """
+
+    def __repr__(self) -> str:
+        return report.in_a_line(self)
+
+    def __str__(self) -> str:
+        return "\n".join(report.lines(self))
+
+    def _repr_html_(self) -> str:
+        return report.html(report.lines(self), self.certified)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write `result.json` and `result.npz` into a folder, for `load`; see `results.save`.
@@ -44,6 +59,23 @@ class Solution(Results):
                 the one that was solved.
         """
         return load(Solution, folder, problem)
+
+    def worst(self, chain: int | None = None, count: int = 10) -> str:
+        """The largest violations of a chain's plan and of its replay, as a table to print.
+
+        A line for each entry of the dynamics, bounds and constraints, at the knot where it is
+        worst, in multiples of what is tolerated: its name, knot, time [s], size and tolerance in
+        your units.
+
+        Args:
+            chain: the best one by default.
+            count: at most so many lines for the plan, and for the replay.
+
+        Raises:
+            DraxError: it was loaded without its problem; there is no such chain.
+        """
+        require_whole("count", count)
+        return worst.table(self, chain, count)
 
     def certify(self, tolerances: Tolerances | None = None) -> Solution:
         """The same solution with every chain replayed again, by the engine that is here now.

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
+from mjx_drax.kernels.compilation import keep_programs
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem, checked
-from mjx_drax.problem.tracing import require_functions
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
@@ -23,6 +23,7 @@ from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
+from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
@@ -35,7 +36,7 @@ def solve(
     seed: int = 0,
     solver: Langevin | Restarts | None = None,
     guess: Trajectory | Solution | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     record: int | None = None,
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
@@ -58,8 +59,10 @@ def solve(
             go on from their knots, multipliers and barriers, at first without noise. Another
             horizon cuts it off, or repeats its last stage. No chain ends worse than a feasible
             guess.
-        progress: called with (iterations done, of how many, diagnostics) every few iterations;
-            Ctrl-C between two calls ends the solve early and keeps what there is.
+        progress: True shows a bar, also while it compiles, False shows nothing; by default there is
+            one if standard error is a terminal or a notebook. A function is called instead with
+            (iterations done, of how many, diagnostics) every few iterations. Ctrl-C between two
+            reports ends the solve early and keeps what there is.
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for
             `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
             and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
@@ -87,7 +90,8 @@ def solve(
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
-    require_functions(progress=progress)
+    report = reporting(progress, problem.name)
+    keep_programs()
     problem = problem.in_precision(precision)
     with problem.arithmetic():
         tolerances = as_tolerances(tolerances)
@@ -104,9 +108,9 @@ def solve(
             guess=given,
             checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
             recorder=recorder,
-            progress=progress,
         )
-        found = search.run()
+        with report as search.progress:
+            found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         solution = _certified(problem, settings, seed, found, interrupted, tolerances)
     return solution if recorder is None else replace(solution, recording=recorder.recording())

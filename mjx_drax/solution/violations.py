@@ -36,7 +36,7 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import joined
-from mjx_drax.solution.names import control_names, state_names
+from mjx_drax.solution.names import control_names, difference_names, state_names
 
 GOAL, TRACKING, DYNAMICS = "goal", "tracking", "dynamics"
 
@@ -193,7 +193,7 @@ class Violation(NamedTuple):
         if self.knot < 0:
             return f"breaks the {words(self.kind)} {by}"
         at = f"at knot {self.knot}, {problem.times[self.knot]:.3g} s"
-        name = _entry_name(problem, self.kind, self.entry)
+        name = entry_name(problem, self.kind, self.entry)
         if self.kind == TRACKING:
             return f"ends off the plan in {name} {by}"
         if self.kind.endswith("bounds"):
@@ -208,14 +208,14 @@ class Violation(NamedTuple):
         return {"size": self.size, "allowed": self.allowed, **at}
 
 
-def _entry_name(problem: Problem, kind: str, entry: int) -> str:
+def entry_name(problem: Problem, kind: str, entry: int) -> str:
     """The name of an entry of a state, a control, a difference of states or a constraint."""
     dynamics = problem.dynamics
     if kind == "control_bounds":
         return control_names(dynamics)[entry]
-    if kind == "state_bounds" or (kind in (TRACKING, DYNAMICS) and dynamics.nx == dynamics.ndx):
+    if kind == "state_bounds":
         return state_names(dynamics)[entry]
-    return f"coordinate {entry}" if kind in (TRACKING, DYNAMICS) else f"[{entry}]"
+    return difference_names(dynamics)[entry] if kind in (TRACKING, DYNAMICS) else f"[{entry}]"
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,7 @@ def _measured(
         states, u = motion
         problem = joined(shared, own)
         start = problem.start_from(states[0])
-        if start is None:
+        if not problem.free:
             problem = replace(problem, x_init=states[0])
         least = (STILL * width for width in scatter_widths(problem))
         E = tuple(map(jnp.maximum, extent, least))
@@ -426,3 +426,71 @@ def _largest(size: Array, allowed: Array, first: int) -> tuple[Array, Array, Arr
     at = jnp.argmax(jnp.where(jnp.isnan(allowed), -1.0, ratio))
     knot, entry = jnp.divmod(at, size.shape[1])
     return size.ravel()[at], allowed.ravel()[at], entry, knot + first
+
+
+def by_entry(
+    problem: Problem,
+    motion: tuple[np.ndarray, np.ndarray],
+    off: np.ndarray,
+    extent: tuple[np.ndarray, ...],
+    tolerances: Tolerances,
+) -> list[Violation]:
+    """Violations of one motion: of each entry of each kind in `MEASURED` that of its worst knot.
+
+    Args:
+        problem: what was solved.
+        motion: states x_0..x_K (K + 1, nx) and controls (K, nu).
+        off: x_K - plan, (ndx,).
+        extent: of the plan, from `extents`, without its first axis.
+        tolerances: what is tolerated.
+    """
+    dtype = problem.x_init.dtype
+    with problem.arithmetic():
+        limits = tolerances.of(problem), tolerances.relative
+        given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+        found = jax.tree.map(np.asarray, _by_entry(problem, *given))
+    return [
+        violation
+        for kind, (size, allowed, first) in zip(MEASURED, found, strict=True)
+        for violation in worst_knots(kind, size, allowed, int(first))
+    ]
+
+
+@jax.jit
+@full_precision
+def _by_entry(
+    problem: Problem,
+    motion: tuple[Array, Array],
+    off: Array,
+    extent: tuple[Array, ...],
+    limits: tuple[tuple[Array, ...], Array],
+) -> list[tuple[Array, Array, int]]:
+    """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
+    (states, u), (given, relative) = motion, limits
+    if not problem.free:
+        problem = replace(problem, x_init=states[0])
+    E = tuple(map(jnp.maximum, extent, (STILL * width for width in scatter_widths(problem))))
+    found = []
+    parts = _sizes_and_scales(problem, states, u, off, E)
+    for (size, scale, first), number in zip(parts, given, strict=True):
+        allowed = jnp.where(jnp.isnan(number), relative * scale, number)
+        found.append((size, jnp.broadcast_to(allowed, size.shape), first))
+    return found
+
+
+def worst_knots(
+    kind: str, size: np.ndarray, allowed: np.ndarray, first: int
+) -> Iterator[Violation]:
+    """Of sizes (knots, entries) in multiples of what is allowed, the largest of each entry.
+
+    Entries without a tolerance, as where there is no bound, are left out.
+    """
+    size = np.nan_to_num(size.astype(float), nan=np.inf)
+    for entry in range(size.shape[1]):
+        column = [
+            Violation(kind, float(s), float(a), entry, first + k)
+            for k, (s, a) in enumerate(zip(size[:, entry], allowed[:, entry], strict=True))
+            if a == a  # NaN is not equal to itself
+        ]
+        if column:
+            yield max(column, key=lambda v: v.ratio)

@@ -62,7 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name, _, chains = word.partition(":")
         problem = tasks.load(name).make()
         for seed in range(options.seeds):
-            print(line(solve(problem, chains=int(chains or 64), seed=seed)), flush=True)
+            print(
+                line(solve(problem, chains=int(chains or 64), seed=seed, progress=False)),
+                flush=True,
+            )
     return 0
 
 

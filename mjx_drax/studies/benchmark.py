@@ -26,6 +26,7 @@ import numpy as np
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import write_json
+from mjx_drax.kernels.compilation import keep_none
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Diagonal
 from mjx_drax.method.schedules import Geometric
@@ -118,6 +119,7 @@ def run(
         DraxError: see `check`.
     """
     check(names, suite)
+    keep_none()
     measured, known = SUITES[suite] if suite else (_tasks, tasks.names)
     rows = []
     for found in measured(tuple(names or known()), seeds, chains):

@@ -148,7 +148,7 @@ def ours(
     devices: int = 1,
 ) -> Row:
     """A solve, and when its first answer was there; with probes=0, only when its last one was."""
-    solution = solve(problem, chains, seed, solver, devices=devices)
+    solution = solve(problem, chains, seed, solver, devices=devices, progress=False)
     replay = seconds_to_replay(problem, np.asarray(solution.best.u, float))
     answers = [*_interrupted(solution, probes), _judged(solution)]
     seconds, share, close = map(list, zip(*answers, strict=True))

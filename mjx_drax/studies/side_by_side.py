@@ -64,10 +64,15 @@ for word in sys.argv[2:]:
 def run(folder: Path, tasks: Sequence[str], seeds: int) -> list[dict[str, Any]]:
     """Rows of every task from one process in that checkout."""
     kept = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    anew = {"JAX_ENABLE_COMPILATION_CACHE": "0"}
     path = os.pathsep.join([str(folder), kept.get("PYTHONPATH", "")])
     command = [sys.executable, "-c", CHILD, str(seeds), *tasks]
     out = subprocess.run(
-        command, cwd=folder, env={**kept, "PYTHONPATH": path}, stdout=subprocess.PIPE, check=True
+        command,
+        cwd=folder,
+        env={**kept, **anew, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        check=True,
     )
     return [json.loads(line) for line in out.stdout.decode().splitlines() if line[:1] == "{"]
 

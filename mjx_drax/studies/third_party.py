@@ -53,12 +53,14 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
         chains: number of chains.
         seed: of the posture and of the solve.
     """
+    from mjx_drax.kernels.compilation import keep_none
     from mjx_drax.modelling.postures import reach
     from mjx_drax.physics.dynamics import MjxDynamics
     from mjx_drax.physics.mjx_model import constraint_rows
     from mjx_drax.physics.source import load
     from mjx_drax.solution.solve import solve
 
+    keep_none()
     row: Row = {"model": name}
     try:
         host = load(path)
@@ -66,7 +68,7 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
         problem = reach(host, seed, name=name)
         assert isinstance(problem.dynamics, MjxDynamics)
         row |= {"rows": constraint_rows(problem.dynamics.model), "knots": problem.horizon}
-        solution = solve(problem, chains, seed)
+        solution = solve(problem, chains, seed, progress=False)
     except DraxError as error:
         return row | {"refused": str(error)}
     best, certificate = solution.best_chain, solution.certificate

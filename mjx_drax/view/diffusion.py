@@ -59,7 +59,7 @@ def render_diffusion(
     ghosts: int | None = None,
     chains: int = 6,
     fps: float = 30.0,
-    size: tuple[int, int] = (600, 800),
+    size: tuple[int, int] = (800, 600),
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
@@ -79,7 +79,7 @@ def render_diffusion(
         parts, which take long to draw without a GPU.
       chains: number of chains whose paths are shown, those of distinct optima first.
       fps: frames per second.
-      size: (height, width) [pixels].
+      size: (width, height) [pixels].
       camera: a camera of the model, see `motion_frames`; None sees all that is shown.
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes, one line of
@@ -104,7 +104,7 @@ def render_diffusion(
     shown = [recording.path(chain) for chain in _chains(solution, chains)]
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
-    height, width = even_size(size)
+    width, height = even_size(size)
     below = 2 * round(_STRIP * height / 2)
     states = finite(solution.replayed[0])
     times = problem.times[: len(states)]
@@ -115,7 +115,7 @@ def render_diffusion(
         states=states,
         times=times,
         frame_times=frame_times(times, fps, speed),
-        size=(height - below, width),
+        size=(width, height - below),
     )
     lines, model = outcome_lines(solution), mujoco_model(problem.dynamics)
     captions = [(_caption(solution, shown[0], at), 0.0, at) for at in film.moments]
@@ -126,7 +126,7 @@ def render_diffusion(
             pictures = _robot_pictures(film, model, ghosts, FREE if camera is None else camera)
         else:
             assert draw is not None  # as checked
-            left = text_box(lines, *film.size)[1][2] / width
+            left = text_box(lines, height - below, width)[1][2] / width
             pictures = _task_pictures(film, draw, np.asarray(problem.x_init, float), left)
         strip = CurveStrip(shown[0], film.colors, below, width)
         for picture, (text, time, at) in zip(pictures, captions, strict=True):
@@ -245,7 +245,7 @@ class Film:
             snapshots.
         states, times: the replay (T, nx) at (T,) [s], up to where it turns non-finite.
         frame_times: of the frames that play it [s].
-        size: (height, width) of the picture above the curves [pixels].
+        size: (width, height) of the picture above the curves [pixels].
     """
 
     shown: Sequence[ChainHistory]
@@ -282,7 +282,8 @@ def _robot_pictures(
     if body is not None:
         points = [body_positions(model, body, chain.x[..., :nq]) for chain in film.shown]
     seen = np.concatenate([qpos, best.x[0, knots, :nq].astype(float)])
-    scene = Scene(model, camera_for(model, seen, camera, film.size[1] / film.size[0]))
+    width, height = film.size
+    scene = Scene(model, camera_for(model, seen, camera, width / height))
 
     def add(at: float, some: npt.NDArray[np.int64], opacity: float) -> None:
         for rank, (line, colors) in enumerate(film.lines(points, at)):
@@ -294,7 +295,7 @@ def _robot_pictures(
             pose = moved(model, one, between(model, one, other), share)
             scene.add_robot(pose, opacity, colors[k, :3])
 
-    with open_renderer(model, *film.size) as renderer:
+    with open_renderer(model, height, width) as renderer:
         for at in film.moments:
             scene.begin(None)
             add(at, knots, _GHOST)
@@ -310,7 +311,8 @@ def _task_pictures(film: Film, draw: Draw, x_init: Floats, left: float) -> Itera
     from matplotlib.collections import LineCollection
 
     points = [_traced(draw, chain.x.astype(float)) for chain in film.shown]
-    canvas = Canvas.within(*film.size, left=left)
+    width, height = film.size
+    canvas = Canvas.within(height, width, left=left)
     axes = canvas.figure.add_subplot()
     artists = [
         LineCollection([], linewidths=2.6 if i == 0 else 1.0, zorder=5 if i == 0 else 4)

@@ -109,20 +109,20 @@ def _with_palette(images: list[Image.Image]) -> list[Image.Image]:
 
 
 def even_size(size: tuple[int, int]) -> tuple[int, int]:
-    """(height, width), both rounded up to even numbers, as H.264 needs them.
+    """(width, height), both rounded up to even numbers, as H.264 needs them.
 
     Raises:
       DraxError: they are not two whole numbers within 16 and 8192.
     """
     try:
-        height, width = (int(side) for side in size)
+        width, height = (int(side) for side in size)
     except (TypeError, ValueError, OverflowError):
-        height = width = 0
-    if isinstance(size, str) or not (16 <= height <= 8192 and 16 <= width <= 8192):
+        width = height = 0
+    if isinstance(size, str) or not (16 <= width <= 8192 and 16 <= height <= 8192):
         raise DraxError(
-            f"size is {shown(size)}: give (height, width), both within 16 and 8192 pixels."
+            f"size is {shown(size)}: give (width, height), both within 16 and 8192 pixels."
         )
-    return height + height % 2, width + width % 2
+    return width + width % 2, height + height % 2
 
 
 def captioned(frame: Frame, lines: Sequence[str], time: float) -> Frame:

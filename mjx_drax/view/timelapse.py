@@ -11,10 +11,11 @@ import numpy as np
 from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.physics.dynamics import mujoco_model
-from mjx_drax.physics.states import finite, interpolated
+from mjx_drax.physics.states import interpolated
 from mjx_drax.view.frames import even_size
 from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import FREE, Scene, camera_for
+from mjx_drax.view.video import states_of
 
 if TYPE_CHECKING:
     from mjx_drax.solution.solution import Solution
@@ -27,10 +28,12 @@ def render_timelapse(
     path: str | os.PathLike[str],
     *,
     count: int = 8,
-    size: tuple[int, int] = (720, 960),
+    size: tuple[int, int] = (960, 720),
     camera: str | int | None = None,
+    chain: int | None = None,
+    plan: bool = False,
 ) -> Path:
-    """One picture of the best chain's motion as it was replayed: ghosts, and the last pose.
+    """One picture of a chain's motion as it was replayed: ghosts, and the last pose.
 
     Ghosts are translucent copies of the robot, equally far apart in time, the fainter the earlier.
 
@@ -38,23 +41,25 @@ def render_timelapse(
       solution: from `solve`, of a problem with a model.
       path: where to, ending in .png; its folder is made if need be.
       count: number of poses, the last one included.
-      size: (height, width) [pixels].
+      size: (width, height) [pixels].
       camera: a camera of the model, see `motion_frames`; None frames the motion.
+      chain, plan: as in `render`: the best chain by default, and its plan instead of the replay.
 
     Raises:
-      DraxError: a path, size, count or camera that cannot be used, or no model.
+      DraxError: a path, size, count, camera or chain that cannot be used, or no model.
     """
     from PIL import Image
 
-    height, width = even_size(size)
+    width, height = even_size(size)
     require_whole("count", count)
     model = mujoco_model(solution.problem.dynamics)
     if model is None:
         raise DraxError(
             f"{solution.problem.name} has no model to show: make the problem with from_mjcf."
         )
-    qpos = finite(solution.replayed[0])[:, : model.nq]
-    times = solution.times[: len(qpos)]
+    which = solution.chain_or_best(chain)
+    qpos = states_of(solution, which, plan)[:, : model.nq]
+    times = solution.times_of(which)[: len(qpos)]
     seen_by = camera_for(model, qpos, FREE if camera is None else camera, width / height)
     scene = Scene(model, seen_by)
     scene.begin(qpos[-1])

@@ -19,6 +19,7 @@ from mjx_drax.base.errors import DraxError, require_positive, shown
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import finite, interpolated
+from mjx_drax.solution.results import optimality
 from mjx_drax.view.drawing import Canvas, knot_at
 from mjx_drax.view.frames import UNCERTIFIED, Frame, captioned, even_size, text_box, write
 from mjx_drax.view.geoms import Floats
@@ -39,33 +40,40 @@ def render(
     path: str | os.PathLike[str],
     *,
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
+    size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
+    chain: int | None = None,
+    plan: bool = False,
 ) -> Path:
-    """Films the best chain's motion as it was replayed, not as it was planned; returns the path.
+    """Films a chain's motion as it was replayed, or as it was planned; returns the path.
 
-    Cost, max|h| and the replay's outcome stand in the picture. A replay that turns non-finite is
-    shown up to there.
+    Cost, max|h| and the replay's outcome, or what the plan breaks, stand in the picture. A motion
+    that turns non-finite is shown up to there.
 
     Args:
       solution: from `solve`.
       path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       fps: frames per second.
-      size: (height, width) [pixels].
+      size: (width, height) [pixels].
       camera: a camera of the model, see `motion_frames`.
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
         for problems without a model (others do not use it).
+      chain: the best one by default.
+      plan: show the knots of the plan, which need not obey the dynamics: what a chain that failed
+        was about to do. By default the better replay is shown.
 
     Raises:
-      DraxError: a path, size, fps, speed or camera that cannot be used, or neither a model nor
-        `draw`.
+      DraxError: a path, size, fps, speed, camera or chain that cannot be used, or neither a model
+        nor `draw`.
     """
     check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
-    states = finite(solution.replayed[0])
-    times, overlay = solution.times[: len(states)], outcome_lines(solution)
+    chain = solution.chain_or_best(chain)
+    states = states_of(solution, chain, plan)
+    times = solution.times_of(chain)[: len(states)]
+    overlay = outcome_lines(solution, chain, plan)
     model = mujoco_model(solution.problem.dynamics)
     if model is not None:
         qpos, look = states[:, : model.nq], {"size": size, "camera": camera, "speed": speed}
@@ -79,7 +87,7 @@ def check(
     problem: Problem,
     *,
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
+    size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
@@ -132,7 +140,7 @@ def motion_frames(
     *,
     overlay: Sequence[str] = (),
     fps: float = 30.0,
-    size: tuple[int, int] = (480, 640),
+    size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
 ) -> Generator[Frame, None, None]:
@@ -144,7 +152,7 @@ def motion_frames(
       times: when they are reached (T,) [s], not decreasing.
       overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
       fps: frames per second.
-      size: (height, width) [pixels]; odd ones are made even, which players ask for.
+      size: (width, height) [pixels]; odd ones are made even, which players ask for.
       camera: a camera's name or index; "free" is one that sees the whole motion. None takes the
         one called "main", or, in a model without one, the free one.
       speed: of the motion; 0.5 is slow motion.
@@ -157,7 +165,7 @@ def motion_frames(
     moments = frame_times(knot_times, fps, speed)
     if isinstance(overlay, str):
         raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
-    height, width = even_size(size)
+    width, height = even_size(size)
     scene = Scene(model, camera_for(model, positions, camera, width / height))
 
     def frames() -> Generator[Frame, None, None]:
@@ -169,22 +177,42 @@ def motion_frames(
     return frames()
 
 
-def outcome_lines(solution: Solution) -> list[str]:
-    """Lines of text about the best chain, short ones, which leave the robot in view."""
-    chain, mode = solution.best_chain, solution.replay_mode
+def states_of(solution: Solution, chain: int, plan: bool) -> np.ndarray:
+    """States (T, nx) of a chain's plan or better replay, up to where they turn non-finite."""
+    if plan:
+        return finite(solution.plans[chain].astype(float))
+    return finite(solution.replays_in(solution.mode_of(chain)).states[chain])
+
+
+def outcome_lines(solution: Solution, chain: int | None = None, plan: bool = False) -> list[str]:
+    """Lines of text about a chain, short ones, which leave the robot in view.
+
+    Args:
+      solution: from `solve`.
+      chain: the best one by default.
+      plan: say what the plan breaks, not what came of its replay.
+    """
+    chain = solution.best_chain if chain is None else chain
+    problem, mode, where = solution.problem, solution.mode_of(chain), None
     cost, defect = float(solution.replay_cost[chain]), float(solution.max_defect[chain])
-    violation = float(solution.replays_in(mode).max_violation[chain])
-    has_model = mujoco_model(solution.problem.dynamics) is not None
+    ran, has_model = solution.replays_in(mode), mujoco_model(problem.dynamics) is not None
+    violation, told = float(ran.max_violation[chain]), ran.outcome(problem, chain)
+    made = f"{'MuJoCo C replay' if has_model else 'float64 rollout'}, {mode}:"
+    if plan:
+        cost, violation = float(solution.cost[chain]), float(solution.max_violation[chain])
+        where = solution.where(chain)
+        told = "keeps to the dynamics" if where is None else where.told(problem)
+        made = f"PLAN of chain {chain}, not a replay:"
     lines = [
-        solution.problem.name,
+        problem.name,
         f"cost {cost:.3g}   max|h| {defect:.1g}",
         f"bound violation {violation:.1g}",
-        solution.optimality,
-        f"{'MuJoCo C replay' if has_model else 'float64 rollout'}, {mode}:",
-        *wrap(solution.outcome(mode), _WIDTH),
+        optimality(float(solution.residual[chain]), solution.tolerance, solution.polished[chain]),
+        made,
+        *wrap(told, _WIDTH),
         "t = {time}",
     ]
-    if not solution.certified:
+    if not solution.certified_chains[chain]:
         infeasible = "the plan is infeasible"
         reason = "no replay succeeds" if solution.feasible[chain] else infeasible
         lines.insert(1, f"{UNCERTIFIED}: {reason}")
@@ -210,8 +238,9 @@ def _drawn_frames(
     size: tuple[int, int],
 ) -> Generator[Frame, None, None]:
     """Frames at some moments [s] of states (T, nx), drawn again at each knot, below the overlay."""
-    top = text_box(overlay, *size)[1][3] / size[0]
-    canvas, drawn = Canvas.within(*size, top=top), -1
+    width, height = size
+    top = text_box(overlay, height, width)[1][3] / height
+    canvas, drawn = Canvas.within(height, width, top=top), -1
     for time in moments:
         knot = knot_at(times, time)
         if knot != drawn:

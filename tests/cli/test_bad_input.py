@@ -110,6 +110,13 @@ COMMANDS = [
      "terminal_cost is 3"),
     ("cost-solver", lambda at: own(at, GOOD_COST + "solver = 'fast'"), "'fast'", "Restarts"),
     ("cost-x_init", lambda at: own(at, GOOD_COST + "x_init = [1, 2, 3]"), "x_init has 3"),
+    ("cost-slip", lambda at: own(at, GOOD_COST + "def terminal_inequalty(data):\n    return 1"),
+     "defines terminal_inequalty", "terminal_inequality"),
+    ("cost-slip-camel", lambda at: own(at, GOOD_COST + "def runningCost(data, u):\n    return 1"),
+     "defines runningCost", "running_cost"),
+    ("cost-slip-term", lambda at: own(at, GOOD_COST + "import mjx_drax\nrunning_residul = "
+     f"mjx_drax.Terms({str(at.file('a.xml', arm()))!r}).control()"), "running_residual"),
+    ("cost-slip-value", lambda at: own(at, GOOD_COST + "x_int = [0.0]"), "x_int", "x_init"),
     ("export-missing", lambda at: ["export", str(at.folder / "gone"), "--csv"], "gone"),
     ("export-nothing", lambda at: ["export", str(at.folder)], "--csv", "at least one"),
     ("export-damaged",

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
-from mjx_drax.cli import main
+from mjx_drax.cli import cost_file, main, pictures
 from mjx_drax.physics.report import text
 from mjx_drax.search.engine import REPORT_EVERY
 
@@ -155,11 +155,26 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     assert not (tmp_path / "video.mp4").exists()
 
 
+def test_the_plan_is_filmed_too_if_nothing_is_certified(slider, tmp_path, monkeypatch):
+    films = []
+    monkeypatch.setattr(
+        "mjx_drax.view.video.render", lambda _, path, **how: films.append((path.name, how))
+    )
+    monkeypatch.setattr("mjx_drax.view.timelapse.render_timelapse", lambda *_, **__: None)
+    names = pictures.write_video(slider, tmp_path, None, {"fps": 5})
+    assert names == ["video.mp4", "timelapse.png"]
+    failed = replace(slider, max_defect=np.ones_like(slider.max_defect))
+    names = pictures.write_video(failed, tmp_path, None, {"fps": 5})
+    assert names == ["video.mp4", "plan.mp4", "timelapse.png"]
+    assert films[-1] == ("plan.mp4", {"draw": None, "plan": True, "fps": 5})
+    assert set(names) < set(pictures.NAMES)
+
+
 def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):
     def interrupt(self, done, total, info):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mjx_drax.cli.progress.Bar.__call__", interrupt)
+    monkeypatch.setattr("mjx_drax.solution.progress.Bar.__call__", interrupt)
     arguments = "solve pendulum --horizon 0.5 --chains 2 --iterations 400 --no-video"
     assert main([*arguments.split(), "--out", str(tmp_path)]) == 1
     assert "written to" in capsys.readouterr().out
@@ -294,6 +309,17 @@ def test_help_names_all_that_a_cost_file_may_define(capsys):
     out = capsys.readouterr().out
     for name in set(signature(from_mjcf).parameters) - {"model", "name"}:
         assert re.search(rf"\b{name}\b", out), name
+
+
+def test_a_cost_file_has_names_of_its_own(own):
+    """Helpers, imports, and what a known name beside it shows to be meant."""
+    (own / "mycost.py").write_text(
+        COST + "import jax.numpy as guesses\nfrom math import cos as horizons\n"
+        "u_init = x_goal = q_goal = 1.0\nu_bound = 2.0\nu_bounds = (-u_bound, u_bound)\n"
+        "def terminal(data):\n    return data.qpos\ndef _goall(data):\n    return True\n"
+    )
+    problem, _ = cost_file.load(str(own / "slider.xml"), str(own / "mycost.py"), None)
+    assert float(problem.bounds.u_upper[0]) <= 2.0
 
 
 def test_errors_name_cause_and_fix(own, capsys):

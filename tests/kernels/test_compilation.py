@@ -1,4 +1,8 @@
-"""Options for the compiler reach it, and one that it does not know is left out."""
+"""Options reach the compiler, those it does not know are left out; what is kept on disk."""
+
+import os
+import subprocess
+import sys
 
 import jax
 import pytest
@@ -45,3 +49,52 @@ def test_it_is_compiled_once_and_can_be_lowered():
     assert program._cache_size() == 1
     assert "multiply" in program.lower(1.0).as_text()
     assert program.__name__ == "doubled"
+
+
+KEEPING = """
+import jax
+import jax.numpy as jnp
+from mjx_drax.kernels.compilation import keep_programs
+
+jax.jit(lambda x: x + 1)(1.0)  # settles for JAX whether it has a cache
+keep_programs()
+jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones(3))
+"""
+
+
+def files_kept(tmp_path, **settings):
+    """How many files a program leaves in the folder of caches."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    env |= {"XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu", **settings}
+    subprocess.run([sys.executable, "-c", KEEPING], env=env, check=True)
+    folder = tmp_path / "mjx_drax" / "jax"
+    return len(list(folder.iterdir())) if folder.is_dir() else 0
+
+
+def test_programs_are_kept_on_disk_although_some_were_compiled_before(tmp_path):
+    assert files_kept(tmp_path) > 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("JAX_ENABLE_COMPILATION_CACHE", "0"), ("JAX_COMPILATION_CACHE_DIR", "{}/other")],
+)
+def test_what_the_user_says_about_the_cache_of_jax_holds(tmp_path, setting, value):
+    assert files_kept(tmp_path, **{setting: value.format(tmp_path)}) == 0
+
+
+def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
+    (tmp_path / "mjx_drax").touch()
+    assert files_kept(tmp_path) == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "given", "level"),
+    [("", None, "3"), ("", "0", "0"), ("", "1", "1"), ("import jax\n", None, "3")],
+)
+def test_the_log_of_xla_is_off_unless_the_user_turns_it_on(before, given, level):
+    name = "TF_CPP_MIN_LOG_LEVEL"
+    env = {k: v for k, v in os.environ.items() if k != name} | ({name: given} if given else {})
+    code = f"{before}import mjx_drax, os; print(os.environ[{name!r}])"
+    done = subprocess.run([sys.executable, "-c", code], env=env, check=True, stdout=subprocess.PIPE)
+    assert done.stdout.decode().strip() == level

@@ -169,7 +169,7 @@ def lqr(A, B, cost):
 
 def test_stiff_penalty_gives_lqr():
     model, cost, multipliers = drawn(5)
-    gains = jax.jit(factorize)(model, cost, multipliers, 1e10).K
+    gains = jax.jit(factorize)(model, cost, multipliers, 1e10)[1].K
     np.testing.assert_allclose(gains, lqr(model.A, model.B, cost), rtol=1e-6, atol=1e-6)
 
 
@@ -191,6 +191,7 @@ def test_long_horizon_gives_the_stationary_lqr():
         np.zeros((long, NU, NDX)),
         every(R),
     )
-    factors = jax.jit(factorize)(model, cost, np.zeros((long, NDX)), 1e10)
+    before, factors = jax.jit(factorize)(model, cost, np.zeros((long, NDX)), 1e10)
     np.testing.assert_allclose(factors.K[0], stationary, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(factors.P[0], P, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(before[0], P, rtol=1e-6, atol=1e-6)

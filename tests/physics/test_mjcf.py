@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, Trajectory, from_mjcf
+from mjx_drax.base.errors import DraxWarning
 from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.model import linearize
 from mjx_drax.models import path
@@ -281,6 +282,7 @@ def test_models_that_are_built(model, sizes, kinked):
     assert dynamics.kinked is kinked
 
 
+@pytest.mark.filterwarnings("ignore:x_init of arm:mjx_drax.base.errors.DraxWarning")
 @pytest.mark.parametrize("start", [0.25, 0.3])
 def test_a_joint_that_starts_at_or_beyond_its_limit_keeps_it_in_the_dynamics(start):
     task = problem(arm(), x_init=[start, 0, 0, 0, 0])
@@ -491,3 +493,11 @@ def test_what_the_engine_would_reset_is_no_replay(substeps):
     assert np.isfinite(states[0]).all()
     assert np.isfinite(states[1, :3]).all()
     assert np.isnan(states[1, 3:]).all()
+
+
+def test_a_start_outside_of_a_joints_range_is_said(recwarn):
+    words = r"x_init of arm .*lift is at 0\.5, its range is -0\.5 to 0\.25 m\): move it inside"
+    with pytest.warns(DraxWarning, match=words):
+        problem(arm(), x_init=[0.5, 0.0, 0.0, 0.0, 0.0])
+    problem(arm(), x_init=[0.25, 9.0, 0.0, 0.0, 0.0])  # on the limit; and a joint without a range
+    assert not [w for w in recwarn if w.category is DraxWarning]

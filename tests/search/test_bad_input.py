@@ -135,7 +135,7 @@ SETTINGS = [
      "guess.u holds NaN"),
     ("guess-text", lambda at: solve(at.point, 2, guess=Trajectory("x", "u")), "guess.x is 'x'"),
     ("guess-none", lambda at: solve(at.point, 2, guess=Trajectory(None, None)), "guess.x"),
-    ("progress", lambda at: solve(at.point, 2, progress=True), "progress is True"),
+    ("progress", lambda at: solve(at.point, 2, progress=3), "progress is 3"),
     ("record-0", lambda at: solve(at.point, 2, record=0), "record is 0"),
     ("record-half", lambda at: solve(at.point, 2, record=0.5), "record is 0.5"),
     ("devices-99", lambda at: solve(at.point, 2, devices=99), "devices is 99", "1 to"),

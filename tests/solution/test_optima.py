@@ -11,12 +11,12 @@ from PIL import Image
 from mjx_drax import DraxError, Langevin, from_function
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.cli import main
-from mjx_drax.cli.summary import optima_lines
 from mjx_drax.problem.cost import as_partial
 from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.solution import optima
 from mjx_drax.solution import save as results
 from mjx_drax.solution.optima import TOLERANCE, cluster
+from mjx_drax.solution.report import optima_lines
 from mjx_drax.solution.results import distinct
 from mjx_drax.solution.solve import solve
 from mjx_drax.view import plotting
@@ -265,7 +265,7 @@ def test_result_files_and_tables_are_bounded(hill, monkeypatch):
     summary = results.summary(many)
     assert (summary["optima_found"], len(summary["optima"])) == (found, 3)
     assert results.arrays(many)["optima_states"].shape == (3, 21, 4)
-    monkeypatch.setattr("mjx_drax.cli.summary.OPTIMA", 3)
+    monkeypatch.setattr("mjx_drax.solution.report.OPTIMA", 3)
     lines = optima_lines(many)
     assert len(lines) == 5  # a heading, three rows, how many more
     assert lines[-1].split() == ["and", str(found - 3), "more"]

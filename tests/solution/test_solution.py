@@ -161,9 +161,9 @@ def test_feedback_tracks_where_open_loop_drifts(pendulum):
     plan = pendulum.open_loop.states[good]
     push = 0.05 * np.random.default_rng(0).normal(size=(good.sum(), problem.horizon, 1))
     u, free = pendulum.trajectories.u[good] + push, (-np.inf, np.inf)
-    gains = pendulum.gains[good].astype(float)
+    gains, knots = pendulum.gains[good].astype(float), problem.knots.at(slice(-1))
     drift, tracked = (
-        np.abs(problem.dynamics.replay(plan, u, K, free)[0] - plan).max(axis=(1, 2))
+        np.abs(problem.dynamics.replay(plan, u, K, free, knots)[0] - plan).max(axis=(1, 2))
         for K in (0 * gains, gains)
     )
     assert np.median(tracked) < 0.4 * np.median(drift)  # at saturated controls it can do little

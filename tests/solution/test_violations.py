@@ -20,10 +20,10 @@ from mjx_drax import (
     solve,
     solve_batch,
 )
-from mjx_drax.cli.summary import lines
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.program import from_program
 from mjx_drax.solution.replay import open_loop_is_better, replays
+from mjx_drax.solution.report import lines
 from mjx_drax.solution.violations import KINDS
 from mjx_drax.view import plotting
 from mjx_drax.view.video import outcome_lines

@@ -14,7 +14,7 @@ import mjx_drax
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
-_SMALL_VIDEO = {"size": (96, 128), "fps": 5}
+_SMALL_VIDEO = {"size": (128, 96), "fps": 5}
 SMALL = {
     "quickstart": {"CHAINS": 4, "VIDEO": _SMALL_VIDEO},
     "your_robot": {"CHAINS": 4, "VIDEO": _SMALL_VIDEO},

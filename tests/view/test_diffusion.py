@@ -99,7 +99,7 @@ def test_film_of_a_model(
     if painted:
         monkeypatch.setattr(renderer, "_gl_context", lambda: None)
     path = render_diffusion(
-        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(180, 240), ghosts=4
+        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(240, 180), ghosts=4
     )
     with Image.open(path) as image:
         assert image.size == (240, 180)
@@ -118,7 +118,7 @@ def test_film_of_a_model(
 def test_film_of_a_function(trapped: Solution, tmp_path: Path) -> None:
     draw = load("bug_trap").draw
     path = render_diffusion(
-        trapped, tmp_path / "film.mp4", seconds=0.4, fps=5, size=(200, 300), draw=draw
+        trapped, tmp_path / "film.mp4", seconds=0.4, fps=5, size=(300, 200), draw=draw
     )
     assert path.stat().st_size > 2000
 
@@ -206,7 +206,7 @@ def test_what_cannot_be_filmed(trapped: Solution, cartpole: Solution, tmp_path: 
 def test_timelapse(cartpole: Solution, tmp_path: Path) -> None:
     pictures = {}
     for count in (1, 2, 6):
-        path = render_timelapse(cartpole, tmp_path / f"{count}.png", count=count, size=(120, 160))
+        path = render_timelapse(cartpole, tmp_path / f"{count}.png", count=count, size=(160, 120))
         with Image.open(path) as image:
             assert image.size == (160, 120)
             pictures[count] = np.asarray(image.convert("RGB"), int)

@@ -99,7 +99,7 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_frames_have_the_asked_shape(backend: str) -> None:
     frames = video.render_frames(
-        _model("pendulum"), [[0.0], [1.0]], [0.0, 0.5], fps=10, size=(HEIGHT, WIDTH)
+        _model("pendulum"), [[0.0], [1.0]], [0.0, 0.5], fps=10, size=(WIDTH, HEIGHT)
     )
     assert frames.shape == (6 + 5, HEIGHT, WIDTH, 3)  # six instants, then half a second held
     assert frames.dtype == np.uint8
@@ -121,7 +121,7 @@ def test_the_robot_is_where_its_angle_says(
 ) -> None:
     down = [0.0] * len(up)
     poses = np.array([down, right, up, [-angle for angle in right]])
-    frames = video.render_frames(_model(name), poses, range(4), fps=1, size=(HEIGHT, WIDTH))
+    frames = video.render_frames(_model(name), poses, range(4), fps=1, size=(WIDTH, HEIGHT))
     middles = [np.argwhere(_amber(frame)).mean(axis=0) for frame in frames[:4]]
     (down_y, down_x), (right_y, right_x), (up_y, up_x), (_, left_x) = middles
     assert left_x + 5 < down_x < right_x - 5
@@ -139,7 +139,7 @@ def test_the_robot_is_where_its_angle_says(
 )
 def test_the_main_camera_sees_every_pose(name: str, poses: list[list[float]], backend: str) -> None:
     frames = video.render_frames(
-        _model(name), poses, range(len(poses)), fps=1, size=(HEIGHT, WIDTH)
+        _model(name), poses, range(len(poses)), fps=1, size=(WIDTH, HEIGHT)
     )
     for frame in frames:
         seen = _amber(frame)
@@ -174,7 +174,7 @@ def test_video_is_one_that_browsers_play(tmp_path: Path, backend: str) -> None:
         path,
         overlay=("max|h| 1e-6", "{time}"),
         fps=20,
-        size=(HEIGHT - 1, WIDTH - 1),
+        size=(WIDTH - 1, HEIGHT - 1),
     )
     assert written == path
     assert [item.name for item in path.parent.iterdir()] == ["swing.mp4"]
@@ -192,7 +192,7 @@ def test_film_of_a_model_shows_the_replay(cartpole: Solution, tmp_path: Path) ->
     far[:, :, 0] = np.linspace(-1.5, 1.5, far.shape[1])
     solution = _judged(cartpole, feasible=True, open_loop=False, feedback=True)
     solution = replace(solution, feedback=replace(solution.feedback, states=far))
-    path = video.render(solution, tmp_path / "film.mp4", fps=20, size=(2 * HEIGHT, 2 * WIDTH))
+    path = video.render(solution, tmp_path / "film.mp4", fps=20, size=(2 * WIDTH, 2 * HEIGHT))
     frames = _decoded(path, 2 * HEIGHT, 2 * WIDTH)
     assert len(frames) == 5 + 10
     left, right = (np.argwhere(_amber(frames[i]))[:, 1].mean() for i in (0, -1))
@@ -206,7 +206,7 @@ def test_film_of_a_function_draws_the_replay_so_far(pendulum: Solution, tmp_path
         seen.append(states)
         _draw_angle(axes, states)
 
-    path = video.render(pendulum, tmp_path / "film.mp4", fps=20, size=(239, 320), draw=draw)
+    path = video.render(pendulum, tmp_path / "film.mp4", fps=20, size=(320, 239), draw=draw)
     frames = _decoded(path, 240, 320)
     assert len(frames) == 21 + 10
     assert [len(states) for states in seen] == list(range(1, 12))  # each knot once
@@ -220,7 +220,7 @@ def test_film_of_a_replay_that_blows_up_stops_there(cartpole: Solution, tmp_path
     blown[:, 6:] = np.nan
     solution = _judged(cartpole, feasible=True, open_loop=False, feedback=False)
     solution = replace(solution, feedback=replace(solution.feedback, states=blown))
-    path = video.render(solution, tmp_path / "film.mp4", fps=20, size=(HEIGHT, WIDTH))
+    path = video.render(solution, tmp_path / "film.mp4", fps=20, size=(WIDTH, HEIGHT))
     assert len(_decoded(path, HEIGHT, WIDTH)) == 3 + 10
 
 
@@ -257,6 +257,35 @@ def test_overlay_says_what_is_certified(
         assert lines[-1] == "t = {time}"
 
 
+def test_the_plan_of_any_chain_can_be_filmed(pendulum: Solution, tmp_path: Path) -> None:
+    x = pendulum.trajectories.x.copy()
+    x[1, 2:] += 1.0
+    failed = replace(
+        pendulum,
+        trajectories=replace(pendulum.trajectories, x=x),
+        max_defect=np.array([1e-6, *np.ones(len(x) - 1)]),
+    )
+    seen: list[np.ndarray] = []
+
+    def draw(axes: Axes, states: np.ndarray) -> None:
+        seen.append(states)
+
+    path = tmp_path / "plan.mp4"
+    video.render(failed, path, fps=2, size=(320, 240), draw=draw, chain=1, plan=True)
+    np.testing.assert_allclose(seen[-1], failed.plans[1], rtol=1e-6)
+    video.render(failed, path, fps=2, size=(320, 240), draw=draw, chain=1)
+    replayed = failed.replays_in(failed.mode_of(1)).states[1]
+    np.testing.assert_array_equal(seen[-1], replayed)
+    lines = video.outcome_lines(failed, 1, plan=True)
+    assert lines[1] == "NOT CERTIFIED: the plan is infeasible"
+    assert "PLAN of chain 1, not a replay:" in lines
+    assert "breaks the dynamics in x" in " ".join(lines)
+    assert "at knot 2," in " ".join(lines)
+    assert "keeps to the dynamics" in video.outcome_lines(failed, 0, plan=True)
+    with pytest.raises(DraxError, match=f"chain is 99: give a number below {len(x)}"):
+        video.render(failed, path, draw=draw, chain=99)
+
+
 def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) -> None:
     first = []
     for success in (True, False):
@@ -264,7 +293,7 @@ def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) ->
         # The same motion, so that only the words differ.
         judged = replace(judged, open_loop=replace(judged.feedback))
         path = tmp_path / f"{success}.mp4"
-        video.render(judged, path, fps=2, size=(240, 320), draw=_draw_angle)
+        video.render(judged, path, fps=2, size=(320, 240), draw=_draw_angle)
         first.append(_decoded(path, 240, 320)[0])
     good, bad = (frame[:60].astype(int) for frame in first)
     assert np.sum(bad[..., 0] > bad[..., 1] + 60) > 2000  # red
@@ -306,7 +335,7 @@ def test_a_model_without_cameras_is_framed(backend: str) -> None:
         </worldbody></mujoco>"""
     )
     poses = [[0.0, 0, 5, 1, 0, 0, 0], [3.0, 0, 6, 0, 1, 0, 0]]
-    for frame in video.render_frames(model, poses, [0.0, 1.0], fps=4, size=(HEIGHT, WIDTH)):
+    for frame in video.render_frames(model, poses, [0.0, 1.0], fps=4, size=(WIDTH, HEIGHT)):
         seen = np.argwhere(_amber(frame))
         assert len(seen) > 20
         assert np.all(seen.min(axis=0) > 0)
@@ -361,7 +390,7 @@ def test_without_opengl_one_warning_names_the_packages(monkeypatch: pytest.Monke
     monkeypatch.setattr(renderer, "_tried_context", fail)
     motion = (_model("pendulum"), [[0.0]], [0.0])
     with pytest.warns(RuntimeWarning, match="apt-get install.*libegl1") as caught:
-        twice = [video.render_frames(*motion, fps=2, size=(HEIGHT, WIDTH)) for _ in range(2)]
+        twice = [video.render_frames(*motion, fps=2, size=(WIDTH, HEIGHT)) for _ in range(2)]
     assert len(caught) == 1
     assert twice[0].shape == (2, HEIGHT, WIDTH, 3)
 
@@ -392,7 +421,7 @@ def test_drawing_leaves_the_environment_alone() -> None:
         "import os; before = dict(os.environ)\n"
         "import mujoco\nfrom mjx_drax.view.video import render_frames\n"
         f"model = mujoco.MjModel.from_xml_path({str(ROOT / 'models' / 'pendulum.xml')!r})\n"
-        "render_frames(model, [[0.0]], [0.0], fps=2, size=(48, 64))\n"
+        "render_frames(model, [[0.0]], [0.0], fps=2, size=(64, 48))\n"
         "assert dict(os.environ) == before\n"
     )
     assert result.returncode == 0, result.stderr

@@ -1,26 +1,40 @@
-"""A solution for a person, in a few lines."""
+"""A solution for a person, in a few lines: `print(solution)`, in a notebook and in the shell."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from html import escape
+
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
-from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
 from mjx_drax.solution.violations import GOAL, TRACKING, words
 
 OPTIMA = 5
 """So many distinct optima are printed."""
 
+LOOK = (
+    "look at it     solution.worst() lists what it breaks, and mjx_drax.render(solution, "
+    '"plan.mp4", plan=True) films what was planned'
+)
+"""Where to look if nothing is certified."""
 
-def lines(solution: Solution) -> list[str]:
+LABEL = 15
+"""Characters of a line that name what it is about."""
+
+_GOOD, _BAD = "#1a7f37", "#cf222e"
+_CELL = "text-align:left;vertical-align:top;white-space:pre-wrap;font-family:monospace"
+
+
+def lines(solution: Results) -> list[str]:
     """Chains, the best one, the three parts of its certificate, distinct optima, times, verdict."""
     best = solution.best_chain
-    counts = _counts(solution.status)
+    found = counts(solution.status)
     if set(solution.polished) & {STALLED, UNFINISHED}:
-        counts += f" (polish: {_counts(solution.polished)})"
+        found += f" (polish: {counts(solution.polished)})"
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     return [
-        f"chains         {solution.chains}: {counts}; {rate}",
+        f"chains         {solution.chains}: {found}; {rate}",
         f"best           cost {solution.replay_cost[best]:.5g} when replayed "
         f"{solution.replay_mode}; plan: {solution.cost[best]:.5g}, max|h| "
         f"{solution.max_defect[best]:.1e}",
@@ -30,22 +44,49 @@ def lines(solution: Solution) -> list[str]:
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
+        *([] if solution.certified else [LOOK]),
         solution.verdict if solution.certified else f"{solution.verdict}: {_advice(solution)}",
     ]
 
 
-def _counts(names: list[str]) -> str:
+def counts(names: list[str]) -> str:
     """How many there are of each name."""
     return ", ".join(f"{names.count(name)} {name}" for name in sorted(set(names)))
 
 
-def _replay(solution: Solution, mode: str) -> str:
+def in_a_line(solution: Results) -> str:
+    """Problem, chains, verdict and cost: what a list of solutions shows of each."""
+    cost = solution.replay_cost[solution.best_chain]
+    return (
+        f"<Solution of {solution.problem.name}: {solution.chains} chains, {solution.verdict}, "
+        f"cost {cost:.5g} when replayed>"
+    )
+
+
+def html(lines: Sequence[str], good: bool) -> str:
+    """Lines as a notebook shows them: a table, the last line, which is the verdict, above it."""
+    rows: list[tuple[str, list[str]]] = []
+    for line in lines[:-1]:
+        label, text = line[:LABEL].strip(), line[LABEL:]
+        if label or not rows:
+            rows.append((label, []))
+        rows[-1][1].append(text)
+    color = _GOOD if good else _BAD
+    cells = "".join(
+        f'<tr><th style="{_CELL}">{escape(label)}</th>'
+        f'<td style="{_CELL}">{escape(chr(10).join(texts))}</td></tr>'
+        for label, texts in rows
+    )
+    return f'<div><b style="color:{color}">{escape(lines[-1])}</b><table>{cells}</table></div>'
+
+
+def _replay(solution: Results, mode: str) -> str:
     """What one of the best chain's replays came to."""
     cost = solution.replays_in(mode).cost[solution.best_chain]
     return f"{solution.outcome(mode)}, cost {cost:.5g}"
 
 
-def constraints(solution: Solution) -> str:
+def constraints(solution: Results) -> str:
     """The largest violation of each kind on the best chain's better replay."""
     violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
     told = [
@@ -56,7 +97,7 @@ def constraints(solution: Solution) -> str:
     return "largest violations: " + ", ".join(told) if told else "the problem has none"
 
 
-def optima_lines(solution: Solution) -> list[str]:
+def optima_lines(solution: Results) -> list[str]:
     """The cheapest of the distinct optima as a table; nothing if no chain is certified."""
     found = solution.optima
     if len(found) < 2:
@@ -84,18 +125,18 @@ def _residual(optimum: Optimum) -> str:
     return f"{optimum.residual:.1e}" if known else "-"
 
 
-def _advice(solution: Solution) -> str:
-    """What to try when no chain could be certified."""
+def _advice(solution: Results) -> str:
+    """What to try when no chain could be certified; the shell has the same names."""
     where = solution.where(solution.best_chain)
     if where is not None:
         unfinished = solution.polished[solution.best_chain] == UNFINISHED
-        more = " or --max-iterations" if unfinished else ""
+        more = ", more max_iterations" if unfinished else ""
         return (
-            f"no plan is feasible; the best {where.told(solution.problem)}. Try more --iterations"
-            f"{more}, or a longer --horizon."
+            f"no plan is feasible; the best {where.told(solution.problem)}. Try more iterations"
+            f"{more}, or a longer horizon."
         )
     return (
-        "feasible chains miss the goal or break constraints when replayed. Try more --chains, a "
-        "higher weight on the terminal cost, or a longer --horizon; --tolerance says what counts "
-        "as broken."
+        "feasible chains miss the goal or break constraints when replayed. Try more chains, a "
+        "higher weight on the terminal cost, or a longer horizon; tolerances say what counts as "
+        "broken."
     )

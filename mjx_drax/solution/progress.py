@@ -1,0 +1,109 @@
+"""Live progress of a solve: a line while it compiles, then a bar with the numbers that matter.
+
+It goes to standard error, and is there by default if that is a terminal or a notebook: else it
+would fill files with lines that are out of date.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mjx_drax.problem.tracing import require_functions
+from mjx_drax.search.iterate import FEASIBLE
+
+if TYPE_CHECKING:
+    from mjx_drax.method.descent import Info
+
+COMPILING = "{desc}: compiling, first iterations [{elapsed}]"
+FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+
+def reporting(
+    progress: Callable[..., None] | bool | None, name: str
+) -> AbstractContextManager[Callable[..., None] | None]:
+    """A context that gives what is called with reports, or None if nothing is to be told.
+
+    Args:
+        progress: a function of the user's; True or False: with a `Bar` or without; None: with one
+            where somebody watches.
+        name: what the bar calls the problem.
+
+    Raises:
+        DraxError: progress is something else.
+    """
+    if progress is None:
+        progress = watched()
+    if progress is True:
+        return Bar(name)
+    if progress is False:
+        return nullcontext()
+    require_functions(progress=progress)
+    return nullcontext(progress)
+
+
+def watched() -> bool:
+    """Whether standard error is a terminal or a notebook."""
+    return sys.stderr is not None and (sys.stderr.isatty() or _in_notebook())
+
+
+def _in_notebook() -> bool:
+    """Whether this is the kernel of a notebook; nothing is imported to find out."""
+    ipython: Any = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+
+
+class Bar:
+    """Called as progress(done, total, info), or (done, total) for problems of a batch; a context.
+
+    The time that compiling takes is shown once a second by a thread, if somebody watches.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, self._best, self._compiled = name, float("inf"), threading.Event()
+
+    def __enter__(self) -> Bar:
+        from tqdm import tqdm
+
+        self._bar = tqdm(desc=self._name, file=sys.stderr, bar_format=COMPILING)
+        self._clock = threading.Thread(target=self._tick, daemon=True)
+        if watched():
+            self._clock.start()
+        return self
+
+    def _tick(self) -> None:
+        while not self._compiled.wait(1.0):
+            self._bar.refresh()
+
+    def _stop_clock(self) -> None:
+        self._compiled.set()
+        if self._clock.is_alive():
+            self._clock.join()
+
+    def __call__(self, done: int, total: int, info: Info | None = None) -> None:
+        """Show how far the solve is."""
+        bar = self._bar
+        if not self._compiled.is_set():
+            self._stop_clock()
+            bar.bar_format = FORMAT
+            bar.reset(total)
+            bar.initial = done
+        if info is not None:
+            feasible = np.asarray(info.max_defect) < FEASIBLE
+            self._best = np.asarray(info.cost)[feasible].min(initial=self._best)
+            numbers = f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
+            bar.set_postfix_str(numbers, False)
+        bar.update(done - bar.n)
+
+    def __exit__(self, *_: object) -> None:
+        bar, told = self._bar, self._compiled.is_set()
+        self._stop_clock()
+        if told:
+            bar.total = bar.n  # fewer iterations than expected were enough
+            bar.refresh()
+        bar.close()

@@ -1,0 +1,105 @@
+"""What a chain breaks most, entry by entry: a table with names and knots, `Solution.worst`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_drax.problem.problem import Problem
+from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.solution.replay import defects
+from mjx_drax.solution.results import Results
+from mjx_drax.solution.violations import (
+    DYNAMICS,
+    TRACKING,
+    Tolerances,
+    Violation,
+    by_entry,
+    entry_name,
+    extents,
+    words,
+    worst_knots,
+)
+
+HEADERS = f"{'what':19}  {'entry':24}  knot  time [s]     size  tolerated"
+
+
+def of_plan(solution: Results, chain: int) -> list[Violation]:
+    """Violations of a chain's plan, those of the dynamics included, the worst first.
+
+    Dynamics and constraints are tolerated up to what makes a plan feasible, 1e-3.
+
+    Raises:
+        DraxError: the solution was loaded without its problem.
+    """
+    problem, plan, u, extent = _motion(solution, chain)
+    off = defects(problem, plan, u)
+    found = list(worst_knots(DYNAMICS, off, np.full(off.shape, FEASIBLE), 0))
+    none = np.zeros(problem.dynamics.ndx)
+    for violation in by_entry(problem, (plan, u), none, extent, Tolerances()):
+        if "equality" in violation.kind:
+            violation = violation._replace(allowed=FEASIBLE)
+        if violation.kind != TRACKING:
+            found.append(violation)
+    return _sorted(found)
+
+
+def of_replay(solution: Results, chain: int) -> list[Violation]:
+    """Violations of a chain's better replay, the worst first.
+
+    Raises:
+        DraxError: the solution was loaded without its problem.
+    """
+    problem, plan, _, extent = _motion(solution, chain)
+    ran = solution.replays_in(solution.mode_of(chain))
+    states, u = ran.states[chain], ran.controls[chain]
+    off = np.nan_to_num(problem.dynamics.host_difference(states, plan), nan=np.inf)[-1]
+    found = by_entry(problem, (states, u), off, extent, solution.tolerances)
+    return _sorted([v for v in found if v.kind != TRACKING or problem.goal is None])
+
+
+def table(solution: Results, chain: int | None = None, count: int = 10) -> str:
+    """The worst violations of a chain's plan and of its better replay, a line for each entry.
+
+    Entries that are not violated at all have no line.
+
+    Args:
+        solution: from `solve`.
+        chain: the best one by default.
+        count: at most so many lines for the plan, and for the replay.
+    """
+    chain, lines = solution.chain_or_best(chain), []
+    mode = solution.mode_of(chain)
+    outcome = solution.replays_in(mode).outcome(solution.problem, chain)
+    for title, found in (
+        (f"plan of chain {chain}", of_plan(solution, chain)),
+        (f"replay {mode} of chain {chain}, which {outcome}", of_replay(solution, chain)),
+    ):
+        broken, shown = sum(v.broken for v in found), [v for v in found if v.size][:count]
+        lines.append(f"{title}: {broken} of {len(found)} entries above what is tolerated")
+        lines += [HEADERS] * bool(shown)
+        lines += [_line(solution.problem, violation) for violation in shown]
+    return "\n".join(lines)
+
+
+def _motion(
+    solution: Results, chain: int
+) -> tuple[Problem, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """The problem, a chain's states x_0..x_K and controls, and their extent."""
+    plan = solution.plans[chain].astype(float)
+    u = np.asarray(solution.trajectories.u[chain])
+    extent = tuple(each[0] for each in extents(solution.problem, plan[None], u[None]))
+    return solution.problem, plan, u, extent
+
+
+def _sorted(found: list[Violation]) -> list[Violation]:
+    """The worst first; where nothing is tolerated, what keeps to it is not broken."""
+    return sorted(found, key=lambda v: v.ratio if v.size else 0.0, reverse=True)
+
+
+def _line(problem: Problem, violation: Violation) -> str:
+    kind, size, allowed, entry, knot = violation
+    mark = "  broken" if violation.broken else ""
+    return (
+        f"{words(kind):19}  {entry_name(problem, kind, entry):24}  {knot:4}  "
+        f"{problem.times[knot]:8.4g}  {size:7.1e}  {allowed:9.1e}{mark}"
+    )

@@ -1,0 +1,111 @@
+"""What costs read by name is what `mujoco.MjData` has under that name."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError, from_mjcf
+
+MODEL = """
+<mujoco model="toy"><option timestep="0.01"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="base"><freejoint name="floating"/><geom name="hull" size="0.1"/>
+      <site name="mark" pos="0.1 0.2 0.3" euler="10 20 30"/>
+      <body name="arm" pos="0 0 0.3"><joint name="shoulder" type="ball"/><geom size="0.1"/>
+        <body name="hand" pos="0.1 0 0.2"><joint name="wrist" axis="0 1 0"/>
+          <camera name="eye" pos="0 0 1"/><geom name="palm" type="box" size="0.1 0.2 0.3"/>
+          <site name="tip" pos="0 0 0.3"/></body></body></body>
+  </worldbody>
+  <tendon><fixed name="cord"><joint joint="wrist" coef="2"/></fixed></tendon>
+  <actuator><motor name="turn" joint="wrist" gear="3"/><motor name="pull" tendon="cord"/></actuator>
+  <sensor><jointpos name="angle" joint="wrist"/><gyro name="rates" site="mark"/></sensor>
+</mujoco>"""
+
+NAMED = {
+    "body": ("hand", "base", "world"),
+    "geom": ("palm", "hull"),
+    "site": ("tip", "mark"),
+    "camera": ("eye",),
+    "joint": ("floating", "shoulder", "wrist"),
+    "actuator": ("pull", "turn"),
+    "tendon": ("cord",),
+    "sensor": ("rates", "angle"),
+}
+
+
+def toy(**functions):
+    return from_mjcf(MODEL, horizon=0.02, **{"terminal_residual": lambda d: d.qvel, **functions})
+
+
+def drawn(problem):
+    rng, dynamics = np.random.default_rng(0), problem.dynamics
+    x = dynamics.valid(jnp.asarray(rng.normal(size=dynamics.nx), jnp.float32))
+    return x, jnp.asarray(rng.normal(size=dynamics.nu), jnp.float32)
+
+
+def values(data, parts):
+    """What the named elements of data have, whichever engine they come from."""
+    found = {}
+    for kind, names in NAMED.items():
+        for name in names:
+            element = getattr(data, kind)(name)
+            assert element.name == name
+            found |= {(kind, name, part): getattr(element, part) for part in parts[kind]}
+    return found
+
+
+def test_elements_have_what_the_c_engine_has_in_the_same_shapes():
+    problem = toy()
+    x, u = drawn(problem)
+    shapes = jax.eval_shape(problem.dynamics.observe, x, u)
+    parts = {kind: set(dir(getattr(shapes, kind)(0))) - {"id", "name"} for kind in NAMED}
+    assert {"xpos", "xquat", "xmat", "cvel"} <= parts["body"]
+    seen = jax.jit(lambda x, u: values(problem.dynamics.observe(x, u), parts))(x, u)
+    model = problem.dynamics.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = x[: model.nq], x[model.nq :], u
+    mujoco.mj_forward(model, data)
+    wanted = values(data, parts)
+    for key, value in seen.items():
+        assert value.shape == wanted[key].shape, key
+        np.testing.assert_allclose(value, wanted[key], rtol=1e-3, atol=2e-3, err_msg=str(key))
+
+
+def test_one_function_is_cost_and_goal_and_its_derivative_is_that_of_the_array():
+    def height(data, *_):
+        return data.site("tip").xpos[2:]
+
+    problem = toy(running_residual=height, goal=lambda data: height(data)[0] < 9)
+    plain = toy(running_residual=lambda data, u: data.site_xpos[1, 2:])
+    x, u = drawn(problem)
+    ours, theirs = (jax.jit(jax.value_and_grad(p.running_cost))(x, u) for p in (problem, plain))
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert problem.reached(np.asarray(x, float)) is True
+
+
+def test_knots_in_a_batch_are_read_along_the_last_axes():
+    problem = toy()
+    x, u = (jnp.stack([a, 2 * a]) for a in drawn(problem))
+    shapes = jax.eval_shape(jax.vmap(problem.dynamics.observe), x, u)
+    mat = jax.eval_shape(lambda data: data.body("hand").xmat, shapes)
+    assert mat.shape == (2, 9)
+    assert jax.eval_shape(lambda data: data.joint("shoulder").qpos, shapes).shape == (2, 4)
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (lambda d: d.site("tpi").xpos, "no site 'tpi': there is 'mark', 'tip'"),
+        (lambda d: d.camera(3).xpos, "no camera 3: there is 'eye'"),
+        (lambda d: d.body(None).xpos, "no body None: there is 'world', 'base', 'arm', 'hand'"),
+        (lambda d: d.geom("palm").xquat, "a geom has no 'xquat': it has xpos, xmat"),
+    ],
+)
+def test_wrong_names_list_those_that_there_are(read, words):
+    with pytest.raises(DraxError, match=re.escape(words)):
+        toy(terminal_residual=read)

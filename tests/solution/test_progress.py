@@ -1,0 +1,80 @@
+"""Progress is shown where somebody watches, and as the switch says."""
+
+import sys
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from builders import point
+
+from mjx_drax import Restarts, solve
+from mjx_drax.solution import progress
+from mjx_drax.solution.progress import Bar, reporting, watched
+
+INFO = SimpleNamespace(
+    max_defect=np.array([1.0, 0.0, np.nan, 1e-5]), cost=np.array([1.0, 5.0, 2.0, 7.0])
+)
+
+
+def test_a_terminal_and_a_notebook_are_watched_a_pipe_is_not(monkeypatch):
+    assert not watched()
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+        assert watched()
+    for shell, notebook in ((SimpleNamespace(kernel=1), True), (SimpleNamespace(), False)):
+        ipython = SimpleNamespace(get_ipython=lambda shell=shell: shell)
+        monkeypatch.setitem(sys.modules, "IPython", ipython)
+        assert watched() is notebook
+    monkeypatch.setattr(sys, "stderr", None)  # as of a program without a console
+    monkeypatch.delitem(sys.modules, "IPython")
+    assert not watched()
+
+
+@pytest.mark.parametrize(("somebody", "kind"), [(True, Bar), (False, type(None))])
+def test_by_default_there_is_a_bar_if_somebody_watches(monkeypatch, capsys, somebody, kind):
+    monkeypatch.setattr(progress, "watched", lambda: somebody)
+    for given, shown in ((None, kind), (True, Bar), (False, type(None))):
+        with reporting(given, "arm") as report:
+            assert type(report) is shown
+    with reporting(print, "arm") as report:
+        assert report is print
+
+
+def test_the_bar_tells_compiling_then_the_best_feasible_cost(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "watched", lambda: True)
+    before = threading.active_count()
+    with Bar("arm") as bar:
+        assert capsys.readouterr().err.strip().startswith("arm: compiling")
+        assert threading.active_count() > before
+        bar(20, 100, INFO)
+        assert not bar._clock.is_alive()
+        bar(40, 100, INFO)
+    shown = capsys.readouterr().err
+    assert "best cost 5, feasible 50%" in shown
+    assert shown.strip().split("\r")[-1].startswith("arm: 100%")  # 40 of 40: no more were needed
+
+
+def test_an_error_while_it_compiles_ends_the_bar_and_its_clock(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "watched", lambda: True)
+    with pytest.raises(ZeroDivisionError), Bar("arm") as bar:
+        raise ZeroDivisionError
+    assert not bar._clock.is_alive()
+
+
+def test_a_batch_counts_problems(capsys):
+    with Bar("problems") as bar:
+        bar(3, 9)
+        bar(9, 9)
+    assert "9/9" in capsys.readouterr().err
+
+
+def test_solve_shows_a_bar_if_asked_and_is_silent_in_a_pipe(capsys):
+    once = Restarts(descent=5, attempts=1)
+    solve(point(), chains=2, solver=once)
+    assert capsys.readouterr() == ("", "")
+    solve(point(), chains=2, solver=once, progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "point: compiling" in err
+    assert "best cost" in err

@@ -1,0 +1,107 @@
+"""What `print` and notebooks show of a solution."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import BALL, arm, made_up, point, robot
+
+from mjx_drax import DraxError, Restarts, Solution, from_program, minimize, solve_batch
+from mjx_drax.solution.names import difference_names
+
+ONCE = Restarts(descent=5, attempts=1)
+
+
+def test_print_is_the_report_and_repr_one_line():
+    solution = made_up(robot())
+    text = str(solution)
+    assert text.splitlines()[0] == ("chains         2: 2 feasible; 100.0% succeed when replayed")
+    assert text.splitlines()[-1] == solution.verdict == "CERTIFIED, not known to be optimal"
+    assert f"engine         {solution.engine}" in text
+    assert repr(solution) == (
+        "<Solution of arm: 2 chains, CERTIFIED, not known to be optimal, cost 0 when replayed>"
+    )
+    assert f"{[solution]}" == f"[{solution!r}]"
+
+
+def test_a_notebook_shows_the_report_as_a_table_and_no_markup_of_others():
+    solution = made_up(point(name="a<b>&c"))
+    good = solution._repr_html_()
+    assert "<b>" not in good
+    assert good.index("CERTIFIED") < good.index("<table>")
+    for line in str(solution).splitlines()[:-1]:
+        assert line[:15].strip() in good
+    bad = replace(solution, max_defect=np.ones(2, np.float32))
+    assert "NOT CERTIFIED: no plan is feasible" in str(bad).splitlines()[-1]
+    colors = [text.split("color:")[1][:7] for text in (good, bad._repr_html_())]
+    assert colors[0] != colors[1]
+
+
+def test_worst_names_entry_and_knot_of_plan_and_replay():
+    problem = point(
+        inequality=lambda x, u: jnp.stack([x[0] - 1.0, 2.0 * u[1] - 0.1]),
+        u_bounds=(-1.0, 1.0),
+        goal=lambda x: True,
+    )
+    made = made_up(problem)
+    x, u = made.trajectories.x.copy(), made.trajectories.u.copy()
+    x[1, 3, 1] = 0.5  # of x_4: the steps from knots 3 and 4 are broken
+    u[1, 6, 1] = 0.25
+    made = replace(made, trajectories=replace(made.trajectories, x=x, u=u))
+    replayed = np.zeros((2, 10, 2))
+    replayed[1, 7, 0] = 1.5
+    made = replace(made, open_loop=replace(made.open_loop, controls=replayed))
+    plan, replay = made.worst(chain=1).split("replay open loop of chain 1")
+    heading, _, *rows = plan.splitlines()
+    assert heading == "plan of chain 1: 2 of 6 entries above what is tolerated"
+    assert [row.split() for row in rows] == [
+        ["dynamics", "x1", "3", "0.3", "5.0e-01", "1.0e-03", "broken"],
+        ["inequality", "[1]", "6", "0.6", "4.0e-01", "1.0e-03", "broken"],
+    ]
+    heading, _, row = replay.splitlines()
+    assert heading.startswith(", which reaches the goal")
+    assert heading.endswith(": 1 of 4 entries above what is tolerated")
+    assert row.split()[:6] == ["control", "bounds", "u0", "7", "0.7", "5.0e-01"]
+    assert len(made.worst(chain=1, count=1).splitlines()) == 6
+    assert len(made.worst(chain=0).splitlines()) == 2  # nothing is violated
+
+
+def test_rotations_of_a_free_joint_have_names():
+    names = difference_names(robot(arm(BALL)).dynamics)
+    assert names[:4] == ["qpos_elbow", "qpos_hip_rx", "qpos_hip_ry", "qpos_hip_rz"]
+    assert names[4:] == ["qvel_elbow", "qvel_hip_wx", "qvel_hip_wy", "qvel_hip_wz"]
+
+
+def test_worst_refuses_what_is_no_chain_and_a_lost_problem(tmp_path):
+    made = made_up(point())
+    for arguments, words in (({"chain": 2}, "chain is 2"), ({"count": 0}, "count is 0")):
+        with pytest.raises(DraxError, match=words):
+            made.worst(**arguments)
+    with pytest.raises(DraxError, match="load"):
+        Solution.load(made.save(tmp_path)).worst()
+
+
+def test_a_minimum_is_shown_with_its_cost_and_what_it_breaks():
+    program = from_program(2, cost=lambda z: z @ z, equality=lambda z: z[:1] - 1.0, name="square")
+    found = minimize(program, chains=2, solver=Restarts(descent=20, attempts=1))
+    text = str(found)
+    cost = f"cost {found.cost[found.best_chain]:.5g}"
+    assert f"best           {cost}, max|h| " in text
+    assert repr(found) == f"<Minimum of square: 2 chains, {text.splitlines()[-1]}, {cost}>"
+    off = replace(found, x=found.x + 1.0, max_defect=np.ones(2))
+    assert str(off).splitlines()[-1].startswith("infeasible: breaks equality [0] by 1.0e+00")
+    assert "infeasible" in off._repr_html_()
+
+
+def test_a_batch_is_shown_by_its_counts_and_by_what_failed():
+    problem = point()
+    starts = jnp.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]])
+    found = solve_batch(lambda x: replace(problem, x_init=x), starts, chains=2, solver=ONCE)
+    assert f"{found!r}".startswith("<BatchSolution of point: 3 of 3 problems CERTIFIED")
+    assert str(found).startswith("problems       3 of 2 chains each: ")
+    lost = replace(found, chain_defect=np.array([[0, 0], [1, 1], [0, 0]], np.float32))
+    assert "not certified  problems 1; where(i)" in str(lost)
+    assert "2 of 3 problems CERTIFIED" in lost._repr_html_()
+    none = replace(found, chain_defect=np.ones((3, 2), np.float32))
+    assert "0 of 3 problems CERTIFIED" in str(none)
