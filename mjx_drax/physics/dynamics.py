@@ -357,11 +357,17 @@ jax.tree_util.register_pytree_node(MjxDynamics, _flatten, _unflatten)
 def mujoco_model(dynamics: Dynamics) -> mujoco.MjModel | None:
     """The MuJoCo model that dynamics come from; None if they come from a function.
 
-    The one place that asks whether dynamics are MuJoCo's. Not for compiled functions, where the
-    model is not known.
+    Here and in `mjx_dynamics` it is asked whether dynamics are MuJoCo's. Not for compiled
+    functions, where the model is not known.
     """
+    own = mjx_dynamics(dynamics)
+    return None if own is None else own.mj_model
+
+
+def mjx_dynamics(dynamics: Dynamics) -> MjxDynamics | None:
+    """The dynamics of a model, or those inside of `Extended`; None if they come from a function."""
     inner = dynamics.inner if isinstance(dynamics, Extended) else dynamics
-    return inner.mj_model if isinstance(inner, MjxDynamics) else None
+    return inner if isinstance(inner, MjxDynamics) else None
 
 
 def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mjx_drax import __version__
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path, require
-from mjx_drax.physics.dynamics import MjxDynamics
+from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import Source
 from mjx_drax.problem.problem import Problem
@@ -67,12 +67,13 @@ def mjcf_of(problem: Problem) -> tuple[mujoco.MjModel, Source]:
     Raises:
         DraxError: the problem has no model, or its MJCF is not known or has changed.
     """
-    if not isinstance(problem.dynamics, MjxDynamics):
+    dynamics = mjx_dynamics(problem.dynamics)
+    if dynamics is None:
         raise DraxError(
             f"{problem.name} has no MuJoCo model to write keyframes of, its dynamics are a "
             "function: see --csv or save_csv."
         )
-    return problem.dynamics.mj_model, problem.dynamics.source()
+    return dynamics.mj_model, dynamics.source()
 
 
 def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:

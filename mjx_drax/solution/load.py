@@ -39,6 +39,7 @@ from mjx_drax.physics.mjx_model import bounded_joints, put_model
 from mjx_drax.physics.source import Source, from_binary
 from mjx_drax.problem.cost import Constraint, Cost
 from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory
 from mjx_drax.search.restarts import Restarts
@@ -292,6 +293,7 @@ def _made(summary: dict[str, Any], arrays: Arrays) -> Problem:
         bounds=_box("problem.bounds", arrays),
         scatter=_box("problem.scatter", arrays),
         horizon=summary["horizon"],
+        free=tuple(tuple(places) for places in summary.get("free", ())),
         t_init=jnp.asarray(arrays.get("problem.t_init", 0.0), x_init.dtype),
         goal=_missing("the goal") if summary["has_goal"] else None,
         name=summary["task"],
@@ -303,15 +305,36 @@ def _constraint(rows: int) -> Constraint:
 
 
 def _dynamics(summary: dict[str, Any], arrays: Arrays) -> Dynamics:
+    further = summary.get("extended")
+    if not further:
+        return _inner_dynamics(summary, arrays, 0)
+    dtype = arrays["problem.x_init"].dtype
+    nominal, u_init = (jnp.asarray(further[name], dtype) for name in ("nominal", "u_init"))
+    added = len(nominal) + further["order"] * len(u_init)
+    return Extended(
+        inner=_inner_dynamics(summary, arrays, added),
+        nominal=nominal,
+        u_init=u_init,
+        free=tuple(further["free"]),
+        shapes=tuple((name, tuple(shape)) for name, shape in further["shapes"]),
+        phases=tuple(further["phases"]),
+        order=further["order"],
+        starts_known=further["starts_known"],
+    )
+
+
+def _inner_dynamics(summary: dict[str, Any], arrays: Arrays, further: int) -> Dynamics:
+    """The dynamics without so many further states."""
     dt = summary["dt"]
     if "model.binary" not in arrays:
         nx, nu = (arrays[f"solution.trajectories.{z}"].shape[-1] for z in "xu")
-        sizes = _missing("f"), dt, nx, nu
+        sizes = _missing("f"), dt, nx - further, nu
         if summary.get("vector_states", True):
             return FunctionDynamics(*sizes)
-        return _Manifold(*sizes, ndx=arrays["solution.gains"].shape[-1])
+        return _Manifold(*sizes, ndx=arrays["solution.gains"].shape[-1] - further)
     mj_model, source = _model(summary, arrays)
-    bounded = bounded_joints(mj_model, np.asarray(arrays["problem.x_init"], float))
+    x_init = np.asarray(arrays["problem.x_init"], float)
+    bounded = bounded_joints(mj_model, x_init[: mj_model.nq + mj_model.nv + mj_model.na])
     planned = put_model(mj_model, summary["contacts"], bounded)
     substeps = round(dt / mj_model.opt.timestep)
     return MjxDynamics(planned, dt, mj_model, substeps, origin=source)

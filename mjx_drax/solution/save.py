@@ -21,9 +21,10 @@ import numpy as np
 from mjx_drax.base.digests import versions
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path, json_data, require_room, write_json
-from mjx_drax.physics.dynamics import MjxDynamics
+from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.physics.source import binary
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.settings import to_data
 from mjx_drax.solution.results import Optimum, Results
@@ -48,6 +49,7 @@ def summary(solution: Results) -> dict[str, Any]:
     best, certificate = solution.best_chain, solution.certificate
     status, polished = solution.status, solution.polished
     dynamics = solution.problem.dynamics
+    model = mjx_dynamics(dynamics)
     where = solution.where(best)
     whole: dict[str, Any] = {
         "format": FORMAT,
@@ -59,8 +61,10 @@ def summary(solution: Results) -> dict[str, Any]:
         "precision": solution.problem.precision,
         "dt": float(solution.problem.dynamics.dt),
         "has_goal": solution.problem.goal is not None,
-        "contacts": dynamics.contacts if isinstance(dynamics, MjxDynamics) else None,
-        "vector_states": type(dynamics).difference is Dynamics.difference,
+        "contacts": None if model is None else model.contacts,
+        "vector_states": dynamics.nx == dynamics.ndx and not _of_a_manifold(dynamics),
+        "free": solution.problem.free,
+        "extended": extended_data(dynamics),
         "settings": to_data(solution.solver),
         "compile_time_s": solution.compile_time,
         "solve_time_s": solution.solve_time,
@@ -93,6 +97,20 @@ def summary(solution: Results) -> dict[str, Any]:
     }
     data: dict[str, Any] = json_data(whole)
     return data
+
+
+def _of_a_manifold(dynamics: Dynamics) -> bool:
+    own = dynamics.inner if isinstance(dynamics, Extended) else dynamics
+    return type(own).difference is not Dynamics.difference
+
+
+def extended_data(dynamics: Dynamics) -> dict[str, Any] | None:
+    """What a file says of further states; None if there are none."""
+    if not isinstance(dynamics, Extended):
+        return None
+    names = "free", "shapes", "phases", "order", "starts_known"
+    numbers = {name: np.asarray(getattr(dynamics, name)).tolist() for name in ("nominal", "u_init")}
+    return {**{name: getattr(dynamics, name) for name in names}, **numbers}
 
 
 def arrays(solution: Results) -> dict[str, np.ndarray]:
@@ -170,8 +188,8 @@ def _whole(solution: Results) -> dict[str, np.ndarray]:
         "problem.scatter": problem.scatter,
     }
     found = {name: value for label, part in parts.items() for name, value in _flat(label, part)}
-    dynamics = problem.dynamics
-    if isinstance(dynamics, MjxDynamics):
+    dynamics = mjx_dynamics(problem.dynamics)
+    if dynamics is not None:
         found["model.binary"] = np.frombuffer(binary(dynamics.mj_model), np.uint8)
         with contextlib.suppress(DraxError):  # without, only the same version can load it
             source = dynamics.source()

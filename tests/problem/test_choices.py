@@ -11,11 +11,17 @@ from builders import DT, K, arm, double_integrator, matrices, robot
 
 from mjx_drax import (
     MPC,
+    Constant,
     DraxError,
+    Identity,
+    Langevin,
     Solution,
     Trajectory,
+    export_keyframes,
     from_function,
     from_mjcf,
+    render,
+    save_csv,
     solve,
     solve_batch,
 )
@@ -233,6 +239,53 @@ def test_jerk_is_the_rate_of_the_rate():
     jerk = np.concatenate([[0.0, 0.0], np.diff(rate[1:]) / DT])
     costs = np.asarray(problem.costs(knots))[:-1]
     np.testing.assert_allclose(costs, 0.5 * (rate**2 + jerk**2), rtol=1e-3)
+
+
+def test_the_papers_own_flow_finds_a_start():
+    problem = double_integrator(
+        running_residual=lambda x, u: jnp.append(u, x[0] - 0.1),
+        terminal_residual=lambda x, knot: x - knot.x_init,
+        x_init_bounds=(-1.0, 1.0),
+    )
+    flow = Langevin(
+        iterations=10,
+        tail=500,
+        step_size=0.02,
+        noise=Constant(0.01),
+        penalty=Constant(10.0),
+        barrier_weight=Constant(1e-3),
+        preconditioner=Identity(),
+    )
+    found = solve(problem, chains=1, solver=flow)
+    assert found.plans[0, 0, 0] == pytest.approx(0.1, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_changed_model_is_saved_loaded_filmed_and_exported(tmp_path):
+    problem = robot(
+        horizon=(0.05, 0.4),
+        knots=12,
+        dt=0.01,
+        parameters={"mass": (1.5, 3.0)},
+        rates=1,
+        model_numbers=lambda model, p: {"body_mass": model.body_mass.at[1].set(p["mass"])},
+        running_cost=lambda data, u, knot: knot.dt * (1 + 1e-3 * knot.rate[0] ** 2),
+        terminal_residual=lambda data, knot: jnp.stack(
+            [30 * (data.qpos[0] - 0.5), data.qvel[0], 0.1 * (knot.parameters["mass"] - 2.0)]
+        ),
+    )
+    found = solve(problem, chains=8)
+    assert found.certified
+    assert found.optimal
+    assert found.parameters["mass"] == pytest.approx(2.0, abs=1e-2)
+    found.save(tmp_path)
+    loaded = Solution.load(tmp_path)
+    assert loaded.parameters == found.parameters
+    np.testing.assert_array_equal(loaded.times, found.times)
+    names = save_csv(loaded, tmp_path / "motion.csv").read_text().splitlines()[0]
+    assert names == "time,qpos_elbow,qvel_elbow,mass,step,before_ctrl_torque,ctrl_torque"
+    assert export_keyframes(loaded, tmp_path / "robot.xml").exists()
+    assert render(loaded, tmp_path / "motion.mp4").stat().st_size > 1000
 
 
 @pytest.mark.slow
