@@ -33,23 +33,25 @@ DAMPING_RANGE = 1e-3, 1e3
 @register_dataclass
 @dataclass(frozen=True)
 class Info:
-    """Diagnostics of a chain: cost, max|h|, bound violation and residual, scalars.
+    """Diagnostics of a chain: cost, max|h|, bound violation, residual and size, scalars.
 
     h holds the dynamics' defects and all constraints; inequalities count where positive. The
-    residual is that of the polish, and not a number elsewhere.
+    residual is that of the polish, and so is the size: that of the cost, whatever constants have
+    been added to it. Elsewhere both are not a number.
     """
 
     cost: Array
     max_defect: Array
     max_violation: Array
     residual: Array
+    size: Array
 
 
 def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     """The diagnostics of a trajectory whose functions have these values."""
     outside = problem.bounds.violation(trajectory)
     unknown = jnp.full_like(outside, jnp.nan)
-    return Info(values.cost, problem.worst(values), outside, unknown)
+    return Info(values.cost, problem.worst(values), outside, unknown, unknown)
 
 
 def augmented_lagrangian(

@@ -164,8 +164,8 @@ class Langevin:
         model = compute(partial(self.model, problem, state, weights, key, tail))
 
         def diffuse() -> tuple[State, Info]:
-            zero = jnp.zeros(())
-            return self.diffuse(problem, state, model, key, tail), Info(zero, zero, zero, zero)
+            nothing = Info(*[jnp.zeros(())] * 5)
+            return self.diffuse(problem, state, model, key, tail), nothing
 
         def descend() -> tuple[State, Info]:
             to = compute(lambda: metric.direction(problem, model, None, state.memory))

@@ -123,6 +123,7 @@ class Progress:
         penalties: eta, shaped like lambda.
         secant: what stages have learned; () where Hessians are exact.
         residual: of the knots where derivatives were taken last, or the last promise if larger.
+        cost: the size of the cost there, free of constants; see `Scales`.
         size: of the last step.
         promise: what the last model promised to gain, relative to the cost.
         funnel: up to where h, relative to the scales of its rows, may grow while the cost falls.
@@ -137,6 +138,7 @@ class Progress:
     penalties: Multipliers
     secant: Any
     residual: Array
+    cost: Array
     size: Array
     promise: Array
     funnel: Array
@@ -161,6 +163,7 @@ def begin(problem: Problem, state: State) -> State:
         penalties=nothing,
         secant=() if problem.dynamics.twice else Secant.none(problem),
         residual=jnp.full((), jnp.inf, zero.dtype),
+        cost=jnp.full((), jnp.nan, zero.dtype),
         size=zero,
         promise=1.0 + zero,
         funnel=FUNNEL + zero,
@@ -211,7 +214,7 @@ def step(
         )
     total = jnp.maximum(residual.total, before.promise)
     optimal = before.optimal | (total < polish.tolerance)
-    now = replace(before, secant=learned, residual=total, optimal=optimal)
+    now = replace(before, secant=learned, residual=total, cost=scales.cost, optimal=optimal)
     stays = ~before.active | optimal | last
     entered = _entered(problem, state, model, now, scales, guided)
     first = before.barrier == 0.0

@@ -257,7 +257,7 @@ class Search:
         self._settle(0, indices, scale)
         state = self._begun(0, knots, keys)
         zeros: Any = np.zeros(rows, knots.u.dtype)
-        info = Info(zeros, zeros, zeros, zeros)
+        info = Info(*[zeros] * 5)
         if not saved:  # else it will be replaced; an answer needs no compiling
             _, info = jax.block_until_ready(self._iterated(state, 0, 0))
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
@@ -356,7 +356,8 @@ class Search:
         assert kept is not None
         cost, feasible = kept.cost.reshape(shape), kept.feasible.reshape(shape)
         assert self.settings.within is not None
-        return finished(cost, feasible, self.settings.within, self.stage.cost_scale)
+        size = np.asarray(kept.info.size).reshape(shape)
+        return finished(cost, feasible, size, self.settings.within, self.stage.cost_scale)
 
     def _merged(self) -> Chains:
         """The best of all attempts, this one included."""
@@ -495,10 +496,11 @@ class Search:
             return None
         assert settings.enough is not None
         assert settings.within is not None
-        costs, feasible = now.cost, now.feasible
+        costs, feasible, sizes = now.cost, now.feasible, np.asarray(now.info.size)
         if kept is not None:  # the best may be among them
             costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.feasible)
-        near = finished(costs, feasible, settings.within, stage.cost_scale[0])
+            sizes = np.append(sizes, kept.info.size)
+        near = finished(costs, feasible, sizes, settings.within, stage.cost_scale[0])
         rows = len(now.cost)
         hopeful = near[:rows] | ~now.feasible
         done = np.zeros(self.chains, bool) if kept is None else near[rows:]
@@ -740,13 +742,23 @@ def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: float) -> f
 
 
 def finished(
-    costs: np.ndarray, feasible: np.ndarray, within: float, cost_scale: ArrayLike
+    costs: np.ndarray,
+    feasible: np.ndarray,
+    sizes: np.ndarray,
+    within: float,
+    cost_scale: ArrayLike,
 ) -> np.ndarray:
-    """Which chains are done, (..., chains), for one problem or several with scales (...,)."""
+    """Which chains are done, (..., chains), for one problem or several with scales (...,).
+
+    Those within a share of the best cost; of its size, (..., chains), where that is smaller, as it
+    is where a large constant has been added to the cost.
+    """
     costs = np.where(feasible, costs, np.inf)
     best = costs.min(axis=-1, keepdims=True)
     known = np.isfinite(best)
-    margin = np.maximum(within * np.abs(best), NEGLIGIBLE * np.expand_dims(cost_scale, -1))
+    size = np.take_along_axis(sizes, costs.argmin(axis=-1, keepdims=True), axis=-1)
+    size = np.fmin(np.abs(best), size)  # sizes may be unknown, NaN
+    margin = np.maximum(within * size, NEGLIGIBLE * np.expand_dims(cost_scale, -1))
     return np.where(known, costs <= best + np.where(known, margin, 0.0), feasible)
 
 

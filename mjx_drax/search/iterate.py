@@ -161,7 +161,7 @@ def loop(
             return moved
 
         zeros = jnp.zeros(states.alive.shape)
-        none = Info(zeros, zeros, zeros, zeros)
+        none = Info(*[zeros] * 5)
         return jax.lax.fori_loop(start, jnp.asarray(stop) + 1, step_or_diagnose, (states, none))
 
     @pruned
@@ -180,7 +180,9 @@ def _diagnosis(q: Question, state: State) -> Info:
     """Where a chain is."""
     knots = state.trajectory
     info = diagnosed(q.problem, knots, q.problem.values(knots))
-    return info if q.polish is None else replace(info, residual=state.polish.residual)
+    if q.polish is None:
+        return info
+    return replace(info, residual=state.polish.residual, size=state.polish.cost)
 
 
 def diffused_or_polished(

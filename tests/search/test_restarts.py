@@ -149,7 +149,7 @@ def attempt(costs, defects, label):
     marks = label + jnp.arange(n)[:, None]
     state = State(marks, marks, marks, marks, (), marks, jnp.ones(n, bool), jnp.full(n, -1))
     none = jnp.zeros(n)
-    info = Info(jnp.asarray(costs, float), jnp.asarray(defects, float), none, none)
+    info = Info(jnp.asarray(costs, float), jnp.asarray(defects, float), none, none, none)
     return Chains(state, info, label + np.arange(n))
 
 
