@@ -47,6 +47,21 @@ def double_integrator_time() -> Problem:
     )
 
 
+def there_and_back() -> Problem:
+    """The same mass is to be at 1 m between two phases, and back at rest at the end."""
+    return in_time(
+        lambda x, u: jnp.array([x[1], u[0]]),
+        x_init=[0.0, 0.0],
+        nu=1,
+        horizon=[(0.5, 5.0), (0.5, 5.0)],
+        knots=[20, 20],
+        equality=lambda x, u, knot: jnp.where(knot.index == 20, x[:1] - 1.0, 0.0),
+        terminal_equality=lambda x: x,
+        u_bounds=(-1.0, 1.0),
+        name="there_and_back",
+    )
+
+
 def brachistochrone_time() -> Problem:
     """A bead slides 10 m sideways and 5 m down; x = [sideways, down, speed], u from down."""
     return in_time(
@@ -339,6 +354,7 @@ CASES = {
     "double_integrator_time": Case(
         double_integrator_time, [1.0, 0.0], "2 sqrt(distance / acceleration)", 2.0, 1e-5
     ),
+    "there_and_back": Case(there_and_back, None, "4 sqrt(distance / acceleration)", 4.0, 1e-5),
     "brachistochrone_time": Case(
         brachistochrone_time, [10.0, 5.0, 9.9], "Bernoulli, 1696; the cycloid", cycloid(), 1e-4
     ),
