@@ -70,7 +70,7 @@ def of_phases(phases: tuple[tuple[float, float, int], ...]) -> tuple[int, float]
 
 
 def from_function(
-    f: Callable[[Array, Array], Array] | Dynamics,
+    f: Callable[..., Array] | Dynamics,
     *,
     x_init: ArrayLike,
     nu: int,

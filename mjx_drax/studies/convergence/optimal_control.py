@@ -30,12 +30,14 @@ class Case:
         end: where the straight line of states ends, (nx,); None: the initial state is held.
         source: where the problem comes from.
         optimum: the least cost of the continuous problem, where it is known.
+        error: by how much the least cost with this many knots may differ from it, relative.
     """
 
     make: Callable[[], Problem]
     end: Sequence[float] | None
     source: str
     optimum: float | None = None
+    error: float = 3e-3
 
     def guess(self, problem: Problem) -> Trajectory:
         """The straight line from x_init to `end`, (K, nx), and middles of the control box."""
@@ -46,21 +48,22 @@ def straight(problem: Problem, end: Sequence[float] | None = None) -> Trajectory
     """States on the straight line from x_init to `end` (nx,), and controls in their middles.
 
     Quaternions are made unit ones. A control that is free is 0, one with a single bound lies at
-    that bound or at 0.
+    that bound or at 0. Parameters and durations are in the middle of their bounds, a free x_0 is
+    next to x_init.
     """
     K, nu, bounds = problem.horizon, problem.dynamics.nu, problem.bounds
-    start = np.asarray(problem.x_init, float)
+    start = np.asarray(problem.x_init, float)[: problem.dynamics.given_nx]
     goal = start if end is None else np.asarray(end, float)
     share = np.arange(1, K + 1)[:, None] / K
-    x = problem.dynamics.valid(jnp.asarray(start + share * (goal - start)))
+    x = jnp.asarray(start + share * (goal - start))
     lower, upper = np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)
     both = np.isfinite(lower) & np.isfinite(upper)
     with np.errstate(invalid="ignore"):
         middle = np.where(both, 0.5 * (lower + upper), np.clip(0.0, lower, upper))
-    return Trajectory(x, jnp.asarray(np.broadcast_to(middle, (K, nu))))
+    return problem.started(Trajectory(x, jnp.asarray(np.broadcast_to(middle, (K, nu)))))
 
 
-def runge_kutta(rate: Rate, dt: float) -> Rate:
+def runge_kutta(rate: Rate, dt: Array | float) -> Rate:
     """x after dt [s] of x' = rate(x, u) under a constant u, by the classical method of order 4."""
 
     def step(x: Array, u: Array) -> Array:
@@ -73,7 +76,7 @@ def runge_kutta(rate: Rate, dt: float) -> Rate:
     return step
 
 
-def integral(rate: Rate, density: Rate, dt: float) -> Rate:
+def integral(rate: Rate, density: Rate, dt: Array | float) -> Rate:
     """The integral of density(x, u) over one step of `runge_kutta`, as a running cost."""
 
     def both(y: Array, u: Array) -> Array:

@@ -1,9 +1,12 @@
 """The suite `convergence`: iterations from one plain guess to a tolerance of 1e-8, beside IPOPT.
 
-    problems  textbook optimal control (`optimal_control`), smooth tasks, and programs of Hock and
+    problems  textbook optimal control (`optimal_control`), also with a free duration, parameters, a
+              free x_0 or a reference (`open_problems`), smooth tasks, and programs of Hock and
               Schittkowski (`programs`)
-    guess     a straight line of states and controls in the middle of their box; for programs the
-              starting point of the book
+    guess     a straight line of states, and controls, parameters and durations in the middle of
+              their box; for programs the starting point of the book
+    optimum   the published cost of the continuous problem, where it is known; that of the program
+              differs by what its knots add, see `Case.error`
     IPOPT     the same program from the same guess, exact derivatives, tol 1e-8, at most 500
               iterations; left out if casadi is not installed
 
@@ -32,12 +35,16 @@ from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import Question, begin, iterate, partition
-from mjx_drax.studies.convergence.optimal_control import CASES, straight
+from mjx_drax.studies.convergence import open_problems, optimal_control
+from mjx_drax.studies.convergence.optimal_control import straight
 from mjx_drax.studies.convergence.programs import PROGRAMS
 from mjx_drax.studies.other_methods import ipopt_jax
 from mjx_drax.studies.other_methods.ipopt import has_casadi
 
 Row = dict[str, Any]
+
+CASES = optimal_control.CASES | open_problems.CASES
+"""Problems of textbooks, by name; those that leave something open or follow a reference last."""
 
 NAME = "convergence"
 
@@ -59,8 +66,8 @@ TASKS: dict[str, Sequence[float] | None] = {
 """The smooth tasks, and where the straight line of their guess ends; None: the start is held."""
 
 HEADER = (
-    "| problem | numbers | IPOPT iterations | IPOPT cost | IPOPT status | iterations | cost "
-    "| residual | status | / IPOPT |\n" + "|---" * 10 + "|"
+    "| problem | numbers | optimum | IPOPT iterations | IPOPT cost | IPOPT status | iterations "
+    "| cost | residual | status | / IPOPT |\n" + "|---" * 11 + "|"
 )
 
 
@@ -102,7 +109,11 @@ def ours(problem: Problem, knots: Trajectory) -> tuple[int, float, float, str]:
 def measure(name: str) -> Row:
     """A row of the table. Needs `jax_enable_x64`."""
     problem, knots = posed(name)
-    row: Row = {"problem": name, "numbers": int(knots.x.size + knots.u.size)}
+    sizes = (int(leaf.size) for leaf in jax.tree.leaves(knots))
+    row: Row = {"problem": name, "numbers": sum(sizes)}
+    known = PROGRAMS[name].optimum if name in PROGRAMS else None
+    known = CASES[name].optimum if name in CASES else known
+    row |= {} if known is None else {"optimum": float(known)}
     if has_casadi():
         answer = ipopt_jax.solve(problem, knots)
         row |= {
@@ -127,7 +138,8 @@ def line(row: Row) -> str:
         return format(row[key], form) if key in row else "-"
 
     return (
-        f"| {row['problem']} | {row['numbers']} | {cell('ipopt_iterations')} "
+        f"| {row['problem']} | {row['numbers']} | {cell('optimum', '.6g')} "
+        f"| {cell('ipopt_iterations')} "
         f"| {cell('ipopt_cost', '.8g')} | {cell('ipopt_status')} | {cell('iterations')} "
         f"| {cell('cost', '.8g')} | {cell('residual', '.0e')} | {cell('status')} "
         f"| {cell('ratio', '.2f')} |"

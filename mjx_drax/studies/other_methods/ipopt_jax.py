@@ -3,7 +3,8 @@
     min  phi(x_K) + sum_k l(x_k, u_k)    over x_1..x_K, u_0..u_{K-1}, all in one vector z
     s.t. f(x_k, u_k) - x_{k+1} = 0,  h = 0,  g <= 0,  bounds on x and u
 
-The program of `problem`, in numbers of states: a quaternion counts as four. Jacobian and Hessian of
+Where x_0 is free, z also has `Trajectory.start` (n0,), which x_0 is linear in. The program of
+`problem`, in numbers of states: a quaternion counts as four. Jacobian and Hessian of
 the Lagrangian are given by blocks, one for each stage. Use it under `jax_enable_x64`; in float32
 IPOPT does not get to its tolerance.
 """
@@ -170,7 +171,7 @@ class Program:
     """The functions of the nonlinear program, in numpy arrays of float64.
 
     Attributes:
-        size: numbers in z = [x_1, .., x_K, u_0, .., u_{K-1}].
+        size: numbers in z = [x_1, .., x_K, u_0, .., u_{K-1}, start].
         rows: of all constraints: defects, those of the stages, those of the end.
         is_equality: which of them are equalities, (rows,).
     """
@@ -179,15 +180,19 @@ class Program:
         self.problem = problem
         K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
         stage, end = problem.constraint, problem.terminal_constraint
-        self.size = K * (nx + nu)
+        self.size = K * (nx + nu) + len(problem.free)
         self.rows = K * (nx + stage.rows) + end.rows
         self.sizes = {"x": [self.size, 0], "lagrangian": [self.size, 0, 1, self.rows]}
         of_stage = np.arange(stage.rows) < stage.equalities
         of_end = np.arange(end.rows) < end.equalities
         self.is_equality = np.concatenate([np.ones(K * nx, bool), np.tile(of_stage, K), of_end])
-        # Columns of (x_k, u_k) in z; those of x_0, which is given, are -1
+        # Columns of (x_k, u_k) in z; -1 for what is given of x_0. An entry of `start` may move
+        # several entries of x_0: these share its column, in which `Pattern` adds them up.
         states = np.arange(-nx, (K - 1) * nx).reshape(K, nx)
         states[0] = -1
+        entry = np.asarray(problem.dynamics.tangent(jnp.arange(nx)))
+        for i, places in enumerate(problem.free):
+            states[0, entry[list(places)]] = K * (nx + nu) + i
         controls = K * nx + np.arange(K * nu).reshape(K, nu)
         self.columns = np.concatenate([states, controls], axis=1)
         self.last = np.arange((K - 1) * nx, K * nx)
@@ -196,12 +201,14 @@ class Program:
 
     def flat(self, knots: Trajectory) -> np.ndarray:
         """z of knots."""
-        return np.concatenate([np.ravel(knots.x), np.ravel(knots.u)]).astype(float)
+        start = () if knots.start is None else knots.start
+        return np.concatenate([np.ravel(knots.x), np.ravel(knots.u), start]).astype(float)
 
     def knots(self, z: Any) -> Trajectory:
         """Knots of z."""
         K, nx, nu = self.problem.horizon, self.problem.dynamics.nx, self.problem.dynamics.nu
-        return Trajectory(z[: K * nx].reshape(K, nx), z[K * nx :].reshape(K, nu))
+        x, u = z[: K * nx].reshape(K, nx), z[K * nx : K * (nx + nu)].reshape(K, nu)
+        return Trajectory(x, u, start=z[K * (nx + nu) :] if self.problem.free else None)
 
     # Functions
 
@@ -212,7 +219,11 @@ class Program:
 
     def gradient(self, z: np.ndarray) -> np.ndarray:
         """Of the cost, (size,)."""
-        return self.flat(jax.device_get(_gradient(self._numbers, self.knots(z))))
+        stage, end = jax.device_get(_gradient(self._numbers, self.knots(z)))
+        columns = np.concatenate([self.columns.ravel(), self.last])
+        free = columns >= 0
+        slopes = np.concatenate([stage.ravel(), end])[free]
+        return np.bincount(columns[free], slopes, self.size)
 
     def jacobian(self, z: np.ndarray) -> np.ndarray:
         """Entries of the constraints' Jacobian, in the order of `jacobian_pattern`."""
@@ -299,11 +310,9 @@ def _values(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
 
 
 @jax.jit
-def _gradient(problem: Problem, knots: Trajectory) -> Trajectory:
+def _gradient(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
     stage = jax.vmap(jax.grad(partial(_cost, problem)))(*_stages(problem, knots))
-    end = jax.grad(problem.terminal_cost)(knots.x[-1])
-    x, u = jnp.split(stage, [problem.dynamics.nx], axis=1)
-    return Trajectory(jnp.concatenate([x[1:], end[None]]), u)
+    return stage, jax.grad(problem.terminal_cost)(knots.x[-1])
 
 
 @jax.jit
