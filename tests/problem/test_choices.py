@@ -69,6 +69,7 @@ def test_the_least_time_of_a_double_integrator(tmp_path):
     np.testing.assert_array_equal(again.open_loop.states, found.open_loop.states)
 
 
+@pytest.mark.slow
 def test_least_times_of_many_distances():
     problem = fastest(
         data={"d": np.ones(21)},
@@ -81,6 +82,7 @@ def test_least_times_of_many_distances():
     np.testing.assert_allclose(found.cost, 2 * np.sqrt(distances), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_two_phases_each_take_their_least_time():
     def there(x, u, knot):
         return jnp.where(knot.index == 12, x - GOAL, 0.0)
@@ -117,6 +119,7 @@ def test_a_free_start_is_chosen_within_its_bounds():
     assert found.certified
 
 
+@pytest.mark.slow
 def test_a_periodic_motion_is_the_steady_response():
     """x'' = -x - 0.1 x' + cos 2t + u: without u, x = Re (e^{2it} / (1 - 4 + 0.2i))."""
 

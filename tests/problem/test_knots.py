@@ -58,6 +58,7 @@ def test_a_reference_is_tracked_and_another_one_does_not_compile():
     assert found.optimal
 
 
+@pytest.mark.slow
 def test_many_references_in_one_call():
     problem = double_integrator(running_residual=off_track, data={"p": np.sin(TIMES)})
     rates = jnp.array([0.5, 1.0, 2.0])
@@ -96,6 +97,7 @@ def _as_replayed(problem, u):
     return plan, u[None, :, None], np.zeros((1, K, 1, 2))
 
 
+@pytest.mark.slow
 def test_the_papers_own_flow_follows_a_reference():
     flow = Langevin(
         iterations=10, tail=300, step_size=1e-3, preconditioner=Identity()
@@ -154,6 +156,7 @@ def test_terms_follow_references():
         np.testing.assert_allclose(costs, 0.5 * np.square(path[1:]), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_data_move_with_the_horizon_of_a_policy():
     problem = double_integrator(running_residual=off_track, data={"p": TIMES})
     later = problem.at_time(0.5)
@@ -181,6 +184,7 @@ def test_a_saved_solution_loads_with_its_problem(tmp_path):
         np.testing.assert_allclose(loaded.problem.times, problem.times)
 
 
+@pytest.mark.slow
 def test_float64_and_data():
     problem = double_integrator(running_residual=off_track, data=lambda t: {"p": jnp.sin(t)})
     double = problem.in_float64()

@@ -46,6 +46,7 @@ def test_another_target_takes_few_iterations(cold):
     np.testing.assert_allclose(warm.cost, other.cost, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_longer_horizon_begins_with_the_old_motion(cold):
     longer = limited(horizon=(K + 4) * DT, data=np.full((K + 5, 1), 1.0))
     warm = solve(longer, chains=2, guess=cold)
