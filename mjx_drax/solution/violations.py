@@ -192,7 +192,9 @@ class Violation(NamedTuple):
             return "misses the goal"
         if self.knot < 0:
             return f"breaks the {words(self.kind)} {by}"
-        at = f"at knot {self.knot}, {problem.times[self.knot]:.3g} s"
+        at = f"at knot {self.knot}"
+        if not getattr(problem.dynamics, "phases", ()):  # else each chain has times of its own
+            at += f", {problem.times[self.knot]:.3g} s"
         name = entry_name(problem, self.kind, self.entry)
         if self.kind == TRACKING:
             return f"ends off the plan in {name} {by}"
