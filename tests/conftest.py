@@ -43,6 +43,19 @@ for _option, _value in {
     jax.config.update(_option, _value)
 
 
+MAPS = Path("/proc/self/maps")
+"""Of this process, a line each; Linux allows 65,530, and every compiled program takes some."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Forget compiled programs before there are too many, which ends a process in compilers."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 25_000:
+        jax.clear_caches()
+        gc.collect()
+
+
 SLIDER = """
 <mujoco model="slider">
   <compiler meshdir="meshes"/>
