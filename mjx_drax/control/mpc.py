@@ -52,7 +52,6 @@ from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
-from mjx_drax.problem.rollout import follow
 from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.search.engine import Chains, Search
 from mjx_drax.search.family import Family
@@ -509,16 +508,9 @@ def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) 
     After a push the knots are far from any motion, and few iterations do not bring them back. The
     controls with their feedback, followed from x, give a motion to start from.
     """
-    dynamics, best, box = problem.dynamics, carried.best, problem.bounds
+    best = carried.best
     knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
-
-    def advance(x: Array, u: Array, knot: Knot) -> Array:
-        return dynamics.at(knot).step(x, u)
-
-    lower, upper = (jnp.broadcast_to(end, knots.u.shape) for end in (box.u_lower, box.u_upper))
-    plan, stages = problem.with_start(knots), problem.knots.at(slice(-1))
-    x, u = follow(advance, dynamics.difference, plan, knots.u, gains, (lower, upper), stages)
-    x = x[1:]
+    x, u = problem.rolled_out(knots, gains)
     rolled = Trajectory(jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0))
     everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
     inside = jax.vmap(partial(flow.inside, problem))(everyone)

@@ -8,7 +8,7 @@ after a full step and more after a short one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -45,6 +45,11 @@ class Info:
     max_violation: Array
     residual: Array
     size: Array
+
+    @classmethod
+    def of(cls, value: Any) -> Info:
+        """The same value for all of them."""
+        return cls(*(value for _ in fields(cls)))
 
 
 def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:

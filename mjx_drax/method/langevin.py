@@ -164,8 +164,7 @@ class Langevin:
         model = compute(partial(self.model, problem, state, weights, key, tail))
 
         def diffuse() -> tuple[State, Info]:
-            nothing = Info(*[jnp.zeros(())] * 5)
-            return self.diffuse(problem, state, model, key, tail), nothing
+            return self.diffuse(problem, state, model, key, tail), Info.of(jnp.zeros(()))
 
         def descend() -> tuple[State, Info]:
             to = compute(lambda: metric.direction(problem, model, None, state.memory))

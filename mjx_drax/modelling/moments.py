@@ -41,9 +41,12 @@ class Windowed:
 
     def __call__(self, *arguments: Any, knot: Knot) -> Array:
         """The function's value, or `idle` for each of its entries."""
+        return jnp.where(self.active(knot), at_knot(self.function, knot)(*arguments), self.idle)
+
+    def active(self, knot: Knot) -> Array:
+        """Whether the function counts at a knot."""
         slop = self.slop * knot.dt
-        active = (knot.time >= self.begin - slop) & (knot.time <= self.end + slop)
-        return jnp.where(active, at_knot(self.function, knot)(*arguments), self.idle)
+        return (knot.time >= self.begin - slop) & (knot.time <= self.end + slop)
 
     def check_knots(self, label: str, times: np.ndarray) -> None:
         """Complain about a window without a knot, where x_0..x_K are at `times` [s]."""
@@ -67,11 +70,10 @@ class AtTime(Windowed):
 
     slop = 0.5
 
-    def __call__(self, *arguments: Any, knot: Knot) -> Array:
-        """The function's value, or `idle` for each of its entries."""
+    def active(self, knot: Knot) -> Array:
+        """Whether the function counts at a knot."""
         off = (knot.time - self.begin) / knot.dt
-        active = (off >= -0.5) & (off < 0.5)
-        return jnp.where(active, at_knot(self.function, knot)(*arguments), self.idle)
+        return (off >= -self.slop) & (off < self.slop)
 
 
 def at_time(function: Callable[..., Any], time: ArrayLike, *, idle: float = 0.0) -> Windowed:

@@ -92,13 +92,6 @@ class Term:
         """Whether it follows a reference, or a term of a sum does."""
         return any(isinstance(n, Reference) or depends_on_knot(n) for n in self.numbers)
 
-    def check_knots(self, label: str, times: np.ndarray) -> None:
-        """Complain about a reference that ends before the knots with `times` [s] do."""
-        for number in self.numbers:
-            for part in (number, *getattr(number, "args", ())):
-                if hasattr(part, "check_knots"):
-                    part.check_knots(label, times)
-
     def __add__(self, other: Callable[..., Array] | int) -> Term:
         """Both residuals in one vector, this one's first; `sum` of terms works as well."""
         return self if isinstance(other, int) and other == 0 else _sum(self, other)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import DraxError, require_part, require_positive
+from mjx_drax.base.errors import DraxError, require_part, require_positive, shown
 from mjx_drax.physics.actuators import inverse_dynamics, middle_control
 from mjx_drax.physics.checks import (
     checked_start,
@@ -27,8 +27,9 @@ from mjx_drax.physics.joints import HINGE, Joints
 from mjx_drax.physics.mjx_model import free_ranges, kept_contacts, put_model
 from mjx_drax.physics.source import load, model_name, origin_of
 from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
-from mjx_drax.problem.choices import Choices, phases_of
+from mjx_drax.problem.choices import Choices, parameter_ends, phases_of
 from mjx_drax.problem.differentiators import Differentiator
+from mjx_drax.problem.extended import named
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.tracing import plain, require_functions
 from mjx_drax.problem.trajectory import Box, Trajectory, box
@@ -149,6 +150,11 @@ def from_mjcf(
     substeps = steps_between_knots(mj_model, dt)
     dt = substeps * mj_model.opt.timestep
     phases = phases_of(horizon, knots)
+    if knots is not None and not phases:
+        raise DraxError(
+            f"knots is {shown(knots)}, and the horizon is {horizon} s: knots are for a free one, "
+            "horizon=(least, most); else give dt."
+        )
     K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
     x0, bounded = checked_start(mj_model, name, x_init)
     warn_of_start_beyond_limits(mj_model, name, x0)
@@ -194,9 +200,10 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
     require_functions(model_numbers=numbers)
     if not parameters:
         raise DraxError("model_numbers is given without parameters: give parameters=..., or none.")
+    shapes, low, high = parameter_ends(parameters)
+    middle = named(shapes, jnp.asarray(0.5 * (low + high)))
     give = "a dictionary of fields of mjx.Model, such as {'body_mass': ...}"
     try:
-        middle = {k: 0.5 * (jnp.asarray(a) + jnp.asarray(b)) for k, (a, b) in parameters.items()}
         found = dict(jax.eval_shape(numbers, dynamics.model, middle))
     except Exception as error:
         raise DraxError(f"model_numbers failed: {plain(error)}. Return {give}.") from error

@@ -53,8 +53,7 @@ from mjx_drax.polish.residual import (
 from mjx_drax.polish.secant import Secant, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.rollout import follow
-from mjx_drax.problem.trajectory import Knot, Stagewise, Trajectory
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
 ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
 """Share of what is promised that a step must bring; the first funnel, and the factor when used."""
@@ -181,16 +180,9 @@ def projected(problem: Problem, state: State) -> State:
     one of them. A chain whose states do not stay finite keeps its knots.
     """
     knots = state.trajectory
-    lower, upper = problem.bounds.sides(replace(knots, slack=None))
-    f, plan, stages = problem.dynamics, problem.with_start(knots), problem.knots.at(slice(-1))
-
-    def advance(x: Array, u: Array, knot: Knot) -> Array:
-        return f.at(knot).step(x, u)
-
-    limits = lower.u, upper.u
-    x, u = follow(advance, f.difference, plan, knots.u, state.gains, limits, stages)
+    x, u = problem.rolled_out(knots, state.gains)
     finite = jnp.isfinite(x).all()
-    x, u = jnp.where(finite, x[1:], knots.x), jnp.where(finite, u, knots.u)
+    x, u = jnp.where(finite, x, knots.x), jnp.where(finite, u, knots.u)
     return replace(state, trajectory=replace(knots, x=x, u=u))
 
 

@@ -21,8 +21,6 @@ from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import require_functions
 from mjx_drax.problem.trajectory import Box, Knot, Trajectory, box
 
-NOTHING_OPEN = Choices()
-
 MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
@@ -229,8 +227,8 @@ def assembled(
     scatter: Box,
     horizon: int,
     near: float,
-    data: Any = None,
-    choices: Choices = NOTHING_OPEN,
+    data: Any,
+    choices: Choices,
     **host: Any,
 ) -> Problem:
     """A problem from its parts, checked.
@@ -250,10 +248,16 @@ def assembled(
     times = float(dynamics.dt) * np.arange(horizon + 1)
     found = rows(data, times)
     first = jax.tree.map(lambda a: a[0], found)
+    steps_most = [np.full(count, most / count) for _, most, count in choices.phases]
+    latest = np.append(0.0, np.cumsum(np.concatenate(steps_most))) if steps_most else times
     for label, function in given.items():
-        check = getattr(function, "check_knots", None)
-        if check is not None:
-            check(label, times)
+        if function is not None:
+            _require_knots(as_partial(function), label, latest)
+    if choices.phases and callable(data):
+        raise DraxError(
+            "data is a function of time, and the horizon is free: read knot.time in the functions "
+            "of the problem, or give arrays with a row for each knot."
+        )
     free: tuple[tuple[int, ...], ...] = ()
     if choices.any:
         parts = extend(choices, dynamics, given, x_init, bounds, scatter)
@@ -282,6 +286,18 @@ def assembled(
             **host,
         )
     )
+
+
+def _require_knots(part: Any, label: str, times: np.ndarray) -> None:
+    """Let all that follows references or windows complain if x_0..x_K, at `times`, do not fit."""
+    nodes = jax.tree.leaves(part, is_leaf=lambda node: node is not part and _checks_knots(node))
+    for node in filter(_checks_knots, nodes):
+        node.check_knots(label, times)
+        _require_knots(node, label, times)
+
+
+def _checks_knots(node: Any) -> bool:
+    return hasattr(node, "check_knots")
 
 
 def require_name(name: object) -> None:

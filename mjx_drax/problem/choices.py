@@ -77,7 +77,7 @@ def phases_of(horizon: Any, knots: Any) -> tuple[tuple[float, float, int], ...]:
     counts = [knots] if one else knots
     try:
         pairs = [tuple(map(float, pair)) for pair in each]
-        counts = [int(count) for count in counts]
+        counts = list(counts)
         good = len(pairs) == len(counts) > 0 and all(len(pair) == 2 for pair in pairs)
     except (TypeError, ValueError):
         good = False
@@ -111,11 +111,13 @@ def extend(
     places, lower, upper = _start(choices, dynamics, x_init)
     asked = any(takes_knot(f) for f in given.values() if f is not None)
     steps = np.array([[a / k, b / k] for a, b, k in choices.phases]).reshape(-1, 2)
+    require_whole("rates", choices.order, 0)
     order = max(choices.order, int(choices.rates is not None))
-    require_whole("rates", order, 0)
     if order > 2:
         raise DraxError(f"rates is {order}: give 1 for the rate of controls, 2 for jerk as well.")
-    shapes, low, high = _parameters(choices.parameters)
+    if choices.u_init is not None and not order:
+        raise DraxError("u_init is given, and nothing reads a rate: give rates=1 as well.")
+    shapes, low, high = parameter_ends(choices.parameters)
     reach = 0.5 * np.ones(len(places))  # where an end is infinite
     near, far = (np.where(np.isfinite(e), e, s * reach) for e, s in ((lower, -1), (upper, 1)))
     if not (shapes or order or len(steps) or (places and asked)):
@@ -128,8 +130,6 @@ def extend(
     u_init = np.zeros(dynamics.nu)
     if choices.u_init is not None:
         u_init = np.asarray(vector("u_init", choices.u_init))
-        if not order:
-            raise DraxError("u_init is given, and nothing reads a rate: give rates=1 as well.")
         if u_init.shape != (dynamics.nu,):
             raise DraxError(f"u_init has shape {u_init.shape}: give {dynamics.nu} numbers.")
     counts = tuple(count for *_, count in choices.phases)
@@ -160,18 +160,18 @@ def extend(
     }
     if choices.rates is not None:
         functions["inequality"] = _with_rates(choices.rates, functions["inequality"], dynamics.nu)
-    has_start = bool(free)
     return Parts(
         whole,
         functions,
         jnp.concatenate([x_init, whole.nominal, jnp.tile(whole.u_init, order)]),
-        _with_start(_wider(bounds, free_of_bounds), _ends(*ends) if has_start else None),
-        _with_start(_wider(scatter, more), _ends(*draws) if has_start else None),
+        _with_start(_wider(bounds, free_of_bounds), _ends(*ends)),
+        _with_start(_wider(scatter, more), _ends(*draws)),
         free,
     )
 
 
 def _ends(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Both, or None where x_0 is fixed."""
     return (lower, upper) if len(lower) else None
 
 
@@ -224,10 +224,14 @@ def _start(
     return places, (lower - x)[free], (upper - x)[free]
 
 
-def _parameters(
+def parameter_ends(
     given: Mapping[str, Pair] | None,
 ) -> tuple[tuple[tuple[str, tuple[int, ...]], ...], np.ndarray, np.ndarray]:
-    """Names and shapes of the parameters, and their lower and upper ends in one vector."""
+    """Names and shapes of the parameters, and their lower and upper ends in one vector.
+
+    Raises:
+        DraxError: ends that are no finite numbers, or that cross.
+    """
     shapes, low, high = [], [np.zeros(0)], [np.zeros(0)]
     if given is not None and not isinstance(given, Mapping):
         raise DraxError(f"parameters are {shown(given)}: give {{name: (lower, upper)}}.")

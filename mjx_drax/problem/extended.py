@@ -130,12 +130,7 @@ class Extended(Dynamics):
 
     def parameters(self, p: Any) -> dict[str, Any]:
         """The parameters by name, of p (..., np)."""
-        found, start = {}, 0
-        for name, shape in self.shapes:
-            end = start + int(np.prod(shape))
-            found[name] = p[..., start:end].reshape((*p.shape[:-1], *shape))
-            start = end
-        return found
+        return named(self.shapes, p)
 
     def at(self, knot: Knot) -> Self:
         """The same at one knot."""
@@ -171,9 +166,6 @@ class Extended(Dynamics):
         """x of x' (..., nx)."""
         return x[..., : self.inner.nx]
 
-    def _inner_tangent(self, dx: Array) -> Array:
-        return dx[..., : self.inner.ndx]
-
     def _joined(self, inner: Array, x: Array) -> Array:
         """x' with another x."""
         return jnp.concatenate([inner, x[..., x.shape[-1] - sum(self.sizes) :]], axis=-1)
@@ -192,7 +184,7 @@ class Extended(Dynamics):
 
     def integrate(self, x: Array, dx: Array) -> Array:
         """x' + dx'."""
-        moved = self.inner.integrate(self.inner_state(x), self._inner_tangent(dx))
+        moved = self.inner.integrate(self.inner_state(x), dx[: self.inner.ndx])
         return jnp.concatenate([moved, x[self.inner.nx :] + dx[self.inner.ndx :]])
 
     def valid(self, x: Array) -> Array:
@@ -288,6 +280,16 @@ class Extended(Dynamics):
             return super().times(states, t_init)
         steps = np.repeat(np.asarray(self.extras(states[0]).h, float), self.phases)
         return t_init + np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def named(shapes: tuple[tuple[str, tuple[int, ...]], ...], p: Any) -> dict[str, Any]:
+    """Parameters by name, of their numbers p (..., np) one after the other."""
+    found, start = {}, 0
+    for name, shape in shapes:
+        end = start + int(np.prod(shape))
+        found[name] = p[..., start:end].reshape((*p.shape[:-1], *shape))
+        start = end
+    return found
 
 
 def with_knot(function: Callable[..., Any] | None) -> Partial | None:

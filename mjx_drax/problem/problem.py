@@ -28,7 +28,7 @@ from mjx_drax.problem.cost import Constraint, Cost
 from mjx_drax.problem.data import later
 from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.problem.rollout import in_double
+from mjx_drax.problem.rollout import follow, in_double
 from mjx_drax.problem.tracing import require_shape
 from mjx_drax.problem.trajectory import Box, Knot, Stagewise, Trajectory, Values
 
@@ -310,6 +310,21 @@ class Problem:
             shape = (*knots.x.shape[:-2], len(self.free))
             knots = replace(knots, start=jnp.broadcast_to(nearest, shape))
         return self.dynamics.consistent(knots) if short else knots
+
+    def rolled_out(self, knots: Trajectory, gains: Array) -> tuple[Array, Array]:
+        """x_1..x_K (K, nx) and controls (K, nu) that f makes of one chain's plan under feedback.
+
+        The controls u_k + K_k (x_k - planned x_k), gains K (K, nu, ndx), within their bounds.
+        """
+        dynamics, box = self.dynamics, self.bounds
+
+        def advance(x: Array, u: Array, knot: Knot) -> Array:
+            return dynamics.at(knot).step(x, u)
+
+        lower, upper = (jnp.broadcast_to(end, knots.u.shape) for end in (box.u_lower, box.u_upper))
+        given = self.with_start(knots), knots.u, gains, (lower, upper), self.knots.at(slice(-1))
+        x, u = follow(advance, dynamics.difference, *given)
+        return x[1:], u
 
     def replay(
         self, plan: ArrayLike, u: ArrayLike, gains: ArrayLike, knots: Knot | None = None

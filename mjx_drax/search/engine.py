@@ -257,7 +257,7 @@ class Search:
         self._settle(0, indices, scale)
         state = self._begun(0, knots, keys)
         zeros: Any = np.zeros(rows, knots.u.dtype)
-        info = Info(*[zeros] * 5)
+        info = Info.of(zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
             _, info = jax.block_until_ready(self._iterated(state, 0, 0))
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
@@ -403,18 +403,19 @@ class Search:
         """The flow and the question of an attempt on some problems."""
         settings, cost = self.settings, cost_scale[indices]
         heated, flow = attempt > 0 and settings.heated, settings.flow
-        warm = attempt == 0 and isinstance(self.guess, Warm)
         noise = np.zeros(len(indices))
         if settings.descent is None:
             cost, noise = (np.broadcast_to(s, len(indices)) for s in vars(flow.scale).values())
         elif not heated:
-            flow = replace(flow, iterations=0 if warm else settings.descent)
+            flow = replace(flow, iterations=settings.descent)
         else:
             kept = self.stage.kept
             assert kept is not None
             shape = self.family.count, self.chains
             rows = kept.cost.reshape(shape)[indices], kept.feasible.reshape(shape)[indices]
             noise = np.sqrt([temperature(*row) for row in zip(*rows, cost, strict=True)])
+        if attempt == 0 and isinstance(self.guess, Warm):
+            flow = replace(flow, iterations=0)
         if self.family.alone:
             if settings.descent is not None:
                 flow = replace(flow, scale=scale_of(cost[0], noise[0]))

@@ -161,7 +161,7 @@ def loop(
             return moved
 
         zeros = jnp.zeros(states.alive.shape)
-        none = Info(*[zeros] * 5)
+        none = Info.of(zeros)
         return jax.lax.fori_loop(start, jnp.asarray(stop) + 1, step_or_diagnose, (states, none))
 
     @pruned

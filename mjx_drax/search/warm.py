@@ -68,14 +68,13 @@ class Warm:
 
 def require_alike(problem: Problem, warm: Warm) -> None:
     """Complain about an answer of a problem of other sizes."""
-    K, dynamics = problem.horizon, problem.dynamics
+    dynamics = problem.dynamics
     stage, end = problem.constraint, problem.terminal_constraint
     for label, own, given in (
         ("entries of the state", dynamics.nx, warm.knots.x.shape[-1]),
         ("controls", dynamics.nu, warm.knots.u.shape[-1]),
         ("constraints of a stage", stage.rows, warm.multipliers.constraints.stage.shape[-1]),
         ("terminal constraints", end.rows, warm.multipliers.constraints.terminal.shape[-1]),
-        ("knots", K, warm.knots.u.shape[1]),
     ):
         if own != given:
             raise DraxError(

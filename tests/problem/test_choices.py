@@ -17,6 +17,7 @@ from mjx_drax import (
     Langevin,
     Solution,
     Trajectory,
+    between,
     export_keyframes,
     from_function,
     from_mjcf,
@@ -359,6 +360,9 @@ def test_the_brachistochrone_and_the_fastest_swing_up():
         ({"rate_bounds": (1.0, -1.0)}, "rate_bounds are"),
         ({"u_init": [0.0]}, "nothing reads a rate"),
         ({"rates": 1, "u_init": [0.0, 1.0]}, "u_init has shape"),
+        ({"rates": "a"}, "rates is 'a'"),
+        ({"knots": 3.7}, "knots"),
+        ({"data": lambda t: t}, "data is a function of time, and the horizon is free"),
     ],
 )
 def test_bad_choices_are_named(changes, message):
@@ -377,6 +381,20 @@ def test_bad_choices_are_named(changes, message):
 def test_bad_numbers_of_a_model_are_named(numbers, message):
     with pytest.raises(DraxError, match=message):
         robot(parameters={"m": (1.0, 2.0)}, model_numbers=numbers)
+
+
+def test_what_a_fixed_problem_cannot_use_is_named():
+    with pytest.raises(DraxError, match="nothing reads a rate"):
+        double_integrator(u_init=[0.0])
+    with pytest.raises(DraxError, match="knots are for a free one"):
+        robot(knots=10)
+
+
+def test_windows_may_lie_within_the_longest_durations():
+    slow = between(lambda x, u: u - 1.0, 4.0, 4.5)
+    assert fastest(inequality=slow).horizon == 20
+    with pytest.raises(DraxError, match="inequality holds from 6 to 7 s"):
+        fastest(inequality=between(lambda x, u: u - 1.0, 6.0, 7.0))
 
 
 def test_policies_refuse_what_is_open():

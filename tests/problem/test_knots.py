@@ -232,5 +232,9 @@ def test_references_of_the_wrong_length_are_named():
     terms = Terms(robot().dynamics.mj_model)
     with pytest.raises(DraxError, match="terminal_residual follows a reference of 4 rows: give 11"):
         robot(terminal_residual=terms.posture(np.zeros((4, 1))), dt=0.01)
+    short, zero = terms.posture(np.zeros((4, 1))), terms.velocity(weight=1e-4)
+    for residual in (zero + short, zero + (zero + short), at_time(short, 0.05)):
+        with pytest.raises(DraxError, match="reference of 4 rows"):
+            robot(running_residual=residual)
     with pytest.raises(DraxError, match=r"posture returned shape \(2,\)"):
         terms.posture(lambda t: jnp.zeros(2))
