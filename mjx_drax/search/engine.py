@@ -301,7 +301,7 @@ class Search:
         for row, index in enumerate(indices):
             mine = slice(row * self.chains, (row + 1) * self.chains)
             of_row = jax.tree.map(lambda a, mine=mine: a[mine], sizes)
-            scale[index], floor[index] = scale_and_floor(of_row)
+            scale[index], floor[index] = scale_and_floor(of_row, self.polish is not None)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
         self._settle(0, indices, scale)
 

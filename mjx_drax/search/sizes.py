@@ -12,7 +12,8 @@ to its floor too. The scale of costs is that of answers, not of knots:
 
 R and T are medians of the running and of the terminal cost above their floors, and E is the median
 of what the running cost loses by a step d of controls alone. With a heavy terminal weight answers
-cost what the way to the goal does, so beyond some weight T no longer counts.
+cost what the way to the goal does, so beyond some weight T no longer counts. Where nothing is
+polished it counts in full: there the penalty alone holds the dynamics against the terminal cost.
 """
 
 from __future__ import annotations
@@ -88,18 +89,19 @@ def _sizes(problem: Problem, knots: Trajectory, by: Any) -> Sizes:
             return dynamics.observe(dynamics.integrate(x, dz[:ndx]), moved), moved
 
         g, H = problem.running.expand(at, len(reach), by, key)
-        step, of_controls = _step(g, H, reach), _step(g[ndx:], H[ndx:, ndx:], reach_u)
-        now = problem.running_cost(x, u)
-        moved = problem.running_cost(dynamics.integrate(x, step[:ndx]), u + step[ndx:])
-        return now, jnp.fmin(now, moved), now - problem.running_cost(x, u + of_controls)
+        of_controls = jnp.zeros_like(g).at[ndx:].set(_step(g[ndx:], H[ndx:, ndx:], reach_u))
+        steps = jnp.stack([jnp.zeros_like(g), _step(g, H, reach), of_controls])
+        now, moved, steered = jax.vmap(lambda dz: problem.running(*at(dz)))(steps)
+        return now, jnp.fmin(now, moved), now - steered
 
     def end(x: Array, key: Array) -> tuple[Array, Array]:
         def at(dx: Array) -> tuple[Any]:
             return (dynamics.observe(dynamics.integrate(x, dx), jnp.zeros(dynamics.nu)),)
 
         step = _step(*problem.terminal.expand(at, ndx, by, key), reach_x)
-        now = problem.terminal_cost(x)
-        return now, jnp.fmin(now, problem.terminal_cost(dynamics.integrate(x, step)))
+        steps = jnp.stack([jnp.zeros_like(step), step])
+        now, moved = jax.vmap(lambda dx: problem.terminal(*at(dx)))(steps)
+        return now, jnp.fmin(now, moved)
 
     keys = jax.random.split(jax.random.key(0), problem.horizon)
     running, least, effort = jax.vmap(stage)(problem.stages(knots), knots.u, keys)
@@ -124,19 +126,23 @@ def _step(g: Array, H: Array, reach: Array) -> Array:
 
 
 def scale_at(problem: Problem, flow: Langevin, knots: Trajectory) -> float:
-    """The scale of costs at knots (chains, K, ...) of one problem."""
+    """The scale of costs at knots (chains, K, ...) of one problem, for a flow with its tail."""
     shared, own = partition(Question(flow, problem), None)
-    return scale_and_floor(sizes_of(own, shared, knots))[0]
+    return scale_and_floor(sizes_of(own, shared, knots), polished=False)[0]
 
 
-def scale_and_floor(sizes: Sizes) -> tuple[float, float]:
-    """The scale of costs of one problem, and the floor of its cost, from chains' (chains,)."""
+def scale_and_floor(sizes: Sizes, polished: bool) -> tuple[float, float]:
+    """The scale of costs of one problem, and the floor of its cost, from chains' (chains,).
+
+    Without a polish it is the penalty that holds the dynamics against the terminal cost: there T
+    counts in full.
+    """
     of_running, of_end = _least(sizes.least_running), _least(sizes.least_terminal)
     R = SHARE * median(np.asarray(sizes.running, float) - of_running)
     T = SHARE * median(np.asarray(sizes.terminal, float) - of_end)
     E = EFFORT * median(sizes.effort)
     limit = max(E, R)
-    return R + (min(T, limit) if limit > 0.0 else T) or 1.0, of_running + of_end
+    return R + (min(T, limit) if polished and limit > 0.0 else T) or 1.0, of_running + of_end
 
 
 def _least(values: Any) -> float:
