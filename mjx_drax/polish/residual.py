@@ -31,6 +31,10 @@ from mjx_drax.problem.trajectory import Trajectory
 CURVED = 1e-2
 """Share of curvature times motion that a term counts as at least: at a perfect fit all vanish."""
 
+FIT = 1e-5
+"""The same where it is compared with terms of other coordinates: a heavy terminal weight has much
+curvature, and must not hide the slopes of controls."""
+
 STILL = 1e-3
 """Share of the largest term below which the scale of others does not fall."""
 
@@ -106,12 +110,14 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     curved = [
         jnp.abs(jnp.einsum("kii->ki", H)) for H in (derivatives.cost.Hxx, derivatives.cost.Huu)
     ]
-    curved = [CURVED * H.max(axis=0, initial=0.0) for H in curved]
-    peaks = [
-        jnp.maximum(part.max(axis=0, initial=0.0), H * moves)
+    parts = [
+        (part.max(axis=0, initial=0.0), H.max(axis=0, initial=0.0) * moves, moves)
         for part, H, moves in zip((sizes.x, sizes.u), curved, (x, u), strict=True)
     ]
-    terms = tiny + jnp.maximum((peaks[0] * x).max(initial=0.0), (peaks[1] * u).max(initial=0.0))
+    peaks = [jnp.maximum(peak, CURVED * bend) for peak, bend, _ in parts]
+    terms = tiny + jnp.max(
+        jnp.stack([(jnp.maximum(p, FIT * b) * moves).max(initial=0.0) for p, b, moves in parts])
+    )
     gradient = derivatives.cost
     of_x, of_u = jnp.sum(jnp.abs(gradient.gx[1:]) * x), jnp.sum(jnp.abs(gradient.gu) * u)
     cost = STILL * terms + STATES * of_x + of_u

@@ -50,14 +50,12 @@ from mjx_drax.search.iterate import (
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
+from mjx_drax.search.sizes import median, scale_and_floor, sizes_of
 from mjx_drax.search.warm import Warm, warmed
 
 REPORT_EVERY = 20
 """Iterations between two reports, records of the history, and chances to interrupt; a hundredth
 of an attempt's where that is more."""
-
-COST_SCALE = 1 / 300
-"""The scale of costs, as a share of the median cost of the initial knots."""
 
 STRICTER = 10.0
 """Factor on the scale of costs after an attempt in which not one chain became feasible."""
@@ -102,6 +100,7 @@ class Stage:
     Attributes:
         attempt: the one that is under way, from 0.
         cost_scale: of each problem, (N,).
+        floor: what costs of each problem are measured from, (N,); see `sizes`.
         todo: problems of this attempt.
         place: how many of them are done; the chunk is what follows.
         begun: whether `now` belongs to this chunk; else it has not begun.
@@ -117,6 +116,7 @@ class Stage:
 
     attempt: int
     cost_scale: np.ndarray
+    floor: np.ndarray
     todo: np.ndarray
     place: int
     begun: bool
@@ -265,7 +265,10 @@ class Search:
         kept = None if family.alone else _unset(now, family.count * self.chains)
         owners, ones = np.tile(np.arange(self.chains), self.size), np.ones(rows)
         records = ((0, info),)
-        self.stage = Stage(0, scale, everyone, 0, True, owners, kept, now, ones, 0, 0, records)
+        floor = np.zeros(family.count)
+        self.stage = Stage(
+            0, scale, floor, everyone, 0, True, owners, kept, now, ones, 0, 0, records
+        )
         self._measure()
 
     def _begun(self, attempt: int, knots: Trajectory, keys: Array) -> State:
@@ -286,7 +289,9 @@ class Search:
         gains = guess.gains if isinstance(guess, Warm) else jnp.zeros_like(state.gains)
         state = replace(state, gains=gains)
         guessed = Chains(state, info, np.zeros(self.chains, int))
-        better = _improved(found, guessed) & (np.asarray(info.max_violation) == 0.0)
+        better = _improved(found, guessed, self.stage.floor[:1]) & (
+            np.asarray(info.max_violation) == 0.0
+        )
         source = np.arange(self.chains) + self.chains * better
         state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
         return Chains(state, info, np.where(better, 0, found.feasible_since))
@@ -315,12 +320,19 @@ class Search:
             self._measure()
 
     def _measure(self) -> None:
-        """The scale of costs of the chunk's problems, from the costs of their initial knots."""
+        """The scale and the floor of costs of the chunk's problems, from their initial knots."""
         stage, indices = self.stage, self.indices
-        costs = np.asarray(gathered(stage.now.info.cost, self.mesh))
-        scale = stage.cost_scale.copy()
-        scale[indices] = [cost_scale_of(row) for row in costs.reshape(self.size, self.chains)]
-        self.stage = replace(stage, cost_scale=scale)
+        if self.settings.descent is None and self.settings.attempts == 1:
+            return  # the schedules have a scale of their own, and no costs are compared
+        shared, own = self.question
+        knots = gathered(stage.now.state.trajectory, self.mesh)
+        sizes = jax.tree.map(np.asarray, sizes_of(own, shared, replace(knots, slack=None)))
+        scale, floor = stage.cost_scale.copy(), stage.floor.copy()
+        for row, index in enumerate(indices):
+            mine = slice(row * self.chains, (row + 1) * self.chains)
+            of_row = jax.tree.map(lambda a, mine=mine: a[mine], sizes)
+            scale[index], floor[index] = scale_and_floor(of_row, self.polish is not None)
+        self.stage = replace(stage, cost_scale=scale, floor=floor)
         self._settle(0, indices, scale)
 
     def _next_chunk(self) -> None:
@@ -355,6 +367,7 @@ class Search:
         kept, shape = self.stage.kept, (self.family.count, self.chains)
         assert kept is not None
         cost, feasible = kept.cost.reshape(shape), kept.feasible.reshape(shape)
+        cost = cost - self.stage.floor[:, None]
         assert self.settings.within is not None
         size = np.asarray(kept.info.size).reshape(shape)
         return finished(cost, feasible, size, self.settings.within, self.stage.cost_scale)
@@ -412,7 +425,8 @@ class Search:
             kept = self.stage.kept
             assert kept is not None
             shape = self.family.count, self.chains
-            rows = kept.cost.reshape(shape)[indices], kept.feasible.reshape(shape)[indices]
+            costs = kept.cost.reshape(shape) - self.stage.floor[:, None]
+            rows = costs[indices], kept.feasible.reshape(shape)[indices]
             noise = np.sqrt([temperature(*row) for row in zip(*rows, cost, strict=True)])
         if attempt == 0 and isinstance(self.guess, Warm):
             flow = replace(flow, iterations=0)
@@ -501,6 +515,7 @@ class Search:
         if kept is not None:  # the best may be among them
             costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.feasible)
             sizes = np.append(sizes, kept.info.size)
+        costs = costs - stage.floor[0]
         near = finished(costs, feasible, sizes, settings.within, stage.cost_scale[0])
         rows = len(now.cost)
         hopeful = near[:rows] | ~now.feasible
@@ -547,7 +562,7 @@ class Search:
         state, info = self._iterated(state, end - iterations, end)
         found = self._whole(Chains(state, info, np.full(len(everyone), done)))
         found = best_of(found, self._rolled_out(found, 1.0, done), everyone)
-        better = _improved(now, found)
+        better = _improved(now, found, np.repeat(stage.floor[self.indices], self.chains))
         now = best_of(now, found, everyone)
         factor = np.where(better, LESS_DAMPING, MORE_DAMPING)
         damping = np.clip(damping * factor, *DAMPING_RANGE)
@@ -725,20 +740,9 @@ def _owners(done: np.ndarray, cost: np.ndarray) -> np.ndarray:
     return np.resize(worst_first[~done[worst_first]] if not done.all() else [0], len(done))
 
 
-def _median(costs: np.ndarray) -> float:
-    """Median of the absolute values of finite costs."""
-    finite = np.abs(costs[np.isfinite(costs)])
-    return float(np.median(finite)) if finite.size else 0.0
-
-
-def cost_scale_of(costs: np.ndarray) -> float:
-    """The scale of costs, from the costs of initial knots (chains,)."""
-    return COST_SCALE * _median(costs) or 1.0
-
-
 def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: float) -> float:
     """The scale of the costs of answers: the best so far, or what all have if none is feasible."""
-    scale = abs(costs[feasible].min()) if feasible.any() else _median(costs)
+    scale = abs(costs[feasible].min()) if feasible.any() else median(costs)
     return max(float(scale), NEGLIGIBLE * cost_scale)
 
 
@@ -751,8 +755,8 @@ def finished(
 ) -> np.ndarray:
     """Which chains are done, (..., chains), for one problem or several with scales (...,).
 
-    Those within a share of the best cost; of its size, (..., chains), where that is smaller, as it
-    is where a large constant has been added to the cost.
+    Those within a share of the best cost, measured from its floor; of its size, (..., chains),
+    where that is smaller.
     """
     costs = np.where(feasible, costs, np.inf)
     best = costs.min(axis=-1, keepdims=True)
@@ -763,9 +767,9 @@ def finished(
     return np.where(known, costs <= best + np.where(known, margin, 0.0), feasible)
 
 
-def _improved(kept: Chains, found: Chains) -> np.ndarray:
+def _improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
     """Which chains became feasible, or cheaper by more than `CHEAPER`, (chains,)."""
-    before, after = (np.asarray(a.info.cost, float) for a in (kept, found))
+    before, after = (np.asarray(a.info.cost, float) - floor for a in (kept, found))
     cheaper = after < before - CHEAPER * np.abs(before)
     return found.feasible & (cheaper | ~kept.feasible)
 

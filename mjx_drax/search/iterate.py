@@ -28,6 +28,7 @@ from mjx_drax.polish import interior_point
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.scaled import without_units
 
 FEASIBLE = 1e-3
 """Largest max|h| that counts as feasible."""
@@ -72,7 +73,7 @@ def joined(shared: Tree, own: Tree) -> Tree:
     return whole
 
 
-def _by_row(shared: Question, own: Question, function: Callable[..., Any], *rows: Any) -> Any:
+def by_row(shared: Question, own: Question, function: Callable[..., Any], *rows: Any) -> Any:
     """function(question, *row) of every row."""
     return jax.vmap(lambda own, *row: function(joined(shared, own), *row))(own, *rows)
 
@@ -91,7 +92,7 @@ def begin(own: Question, shared: Question, knots: Trajectory, keys: Array) -> St
         state = q.flow.init(q.problem, knots, key)
         return state if q.polish is None else interior_point.begin(q.problem, state)
 
-    started: State = _by_row(shared, own, first, knots, keys)
+    started: State = by_row(shared, own, first, knots, keys)
     return started
 
 
@@ -103,7 +104,7 @@ def chain_keys(key: Array, chains: int) -> Array:
 @jax.jit
 def restart_at(own: Question, shared: Question, states: State, knots: Trajectory) -> State:
     """The chains with other knots (rows, K, ...), and slacks that go with them."""
-    inside = _by_row(shared, own, lambda q, z: q.flow.inside(q.problem, z), knots)
+    inside = by_row(shared, own, lambda q, z: q.flow.inside(q.problem, z), knots)
     return State(**{**vars(states), "trajectory": inside})
 
 
@@ -144,20 +145,20 @@ def loop(
         @pruned
         def refine(carry: tuple[Array, State]) -> tuple[Array, State]:
             i, states = carry
-            return i + 1, _by_row(shared, own, partial(polished, i), states)
+            return i + 1, by_row(shared, own, partial(polished, i), states)
 
         def unfinished(carry: tuple[Array, State]) -> Array:
             i, states = carry
             return (i < stop) & (states.polish.active & states.alive).any()
 
         states = jax.lax.while_loop(unfinished, refine, (jnp.asarray(start, int), states))[1]
-        return states, _by_row(shared, own, _diagnosis, states) if diagnose else None
+        return states, by_row(shared, own, _diagnosis, states) if diagnose else None
 
     if diagnose and tail and shared.problem.dynamics.kinked:
 
         @pruned  # jit does it to all but the bodies of loops
         def step_or_diagnose(i: Array, carry: tuple[State, Info]) -> tuple[State, Info]:
-            moved: Any = _by_row(shared, own, partial(one, i, i < stop), carry[0])
+            moved: Any = by_row(shared, own, partial(one, i, i < stop), carry[0])
             return moved
 
         zeros = jnp.zeros(states.alive.shape)
@@ -166,14 +167,14 @@ def loop(
 
     @pruned
     def step(i: Array, states: State) -> State:
-        moved: State = _by_row(shared, own, partial(one, i, None), states)[0]
+        moved: State = by_row(shared, own, partial(one, i, None), states)[0]
         return moved
 
     states = jax.lax.fori_loop(start, stop, step, states)
     if not diagnose:
         return states, None
 
-    return states, _by_row(shared, own, _diagnosis, states)
+    return states, by_row(shared, own, _diagnosis, states)
 
 
 def _diagnosis(q: Question, state: State) -> Info:
@@ -205,7 +206,7 @@ def diffused_or_polished(
     last = iteration + 1 == flow.iterations + polish.iterations
     new = jax.lax.cond(
         noisy,
-        lambda: flow.diffuse(problem, state, model, key),
+        lambda: without_units(flow, problem).diffuse(problem, state, model, key),
         lambda: interior_point.step(problem, state, model, polish, last, guided),
     )
     return keep_finite(state, new, iteration, None)
@@ -235,7 +236,7 @@ def feedback_gains(own: Question, shared: Question, states: State) -> Array:
         model = expand(q.problem, flow.bounds, knots, *present, key)
         return metric.direction(q.problem, model, None, ()).gains
 
-    found: Array = _by_row(shared, own, gains, states)
+    found: Array = by_row(shared, own, gains, states)
     return found
 
 

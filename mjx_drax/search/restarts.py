@@ -9,9 +9,13 @@ makes several tries for each, and every chain keeps the best that was found for 
 
 Schedules are multiples of scales that are measured, so no setting depends on the units of a cost:
 
-    cost     a share of the median cost of the initial knots, for mu, delta and rho; ten times as
-             much after an attempt in which not one chain became feasible
+    cost     a share of the median cost of the initial knots, of which a heavy terminal weight does
+             not count in full (`sizes`), for mu, delta and rho; ten times as much after an attempt
+             in which not one chain became feasible
     noise    the square root of the best cost so far, for sigma
+
+Costs are measured from their floor (`sizes`), so constants that are added to them change nothing.
+Where a Gauss-Newton flow is polished, states and controls are measured by their box (`scaled`).
 
 Where f has kinks (contacts, limits, dry friction), noise was never seen to help, so by default all
 attempts descend there, and `Rollouts` follow each.

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import numpy as np
 
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
@@ -30,9 +29,8 @@ from mjx_drax.kernels.compilation import keep_none
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Diagonal
 from mjx_drax.method.schedules import Geometric
-from mjx_drax.search.engine import cost_scale_of
-from mjx_drax.search.iterate import evaluate
 from mjx_drax.search.restarts import Restarts
+from mjx_drax.search.sizes import scale_at
 from mjx_drax.studies import one_thread
 from mjx_drax.studies.convergence.suite import NAME as CONVERGENCE
 from mjx_drax.studies.measurements import (
@@ -254,7 +252,7 @@ def ablations(problem: Problem, solver: Restarts) -> dict[str, Langevin | Restar
 def _random_pendulums(count: int, seeds: Sequence[int]) -> Iterator[Row]:
     problem, solver, _ = _task("pendulum")
     knots = jax.vmap(problem.draw)(jax.random.split(jax.random.key(0), 1024))
-    first = solver.first(cost_scale_of(np.asarray(evaluate(problem, knots).cost)))
+    first = solver.first(scale_at(problem, solver.flow, knots))
     program = Transcription(problem) if has_casadi() else None
     for seed in seeds:
         yield random_states(problem, first, count, seed, program=program)
