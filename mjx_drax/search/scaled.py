@@ -33,7 +33,10 @@ STATES, CONTROLS = 6.0, 2.0
 @register_dataclass
 @dataclass(frozen=True)
 class Scaled(Metric):
-    """The metric in units S = x (ndx,) of states and U = u (nu,) of controls; a free x_0 keeps its."""
+    """The metric in units S = x (ndx,) of states and U = u (nu,) of controls.
+
+    The changes of a free x_0 keep the user's units.
+    """
 
     metric: GaussNewton
     x: Array
