@@ -10,7 +10,6 @@ import pytest
 from builders import DT, K, arm, double_integrator, matrices, robot
 
 from mjx_drax import (
-    MPC,
     Constant,
     DraxError,
     Identity,
@@ -397,9 +396,19 @@ def test_windows_may_lie_within_the_longest_durations():
         fastest(inequality=between(lambda x, u: u - 1.0, 6.0, 7.0))
 
 
-def test_policies_refuse_what_is_open():
-    with pytest.raises(DraxError, match="MPC starts where the robot is"):
-        MPC(fastest())
+def test_a_free_duration_and_rates_are_counted_from_where_x_0_is():
+    problem = fastest(rates=1, u_init=None)
+    knots, later = problem.draw(jax.random.key(0)), problem.at_time(3.0)
+
+    def seen(problem):
+        x, u, at = problem.stages(knots)
+        return jax.vmap(lambda x, u, knot: problem.dynamics.at(knot).here(x, u))(x, u, at)
+
+    now, then = seen(problem), seen(later)
+    np.testing.assert_allclose(then.time - 3.0, now.time, atol=1e-5)
+    np.testing.assert_array_equal(then.dt, now.dt)
+    np.testing.assert_array_equal(then.rate, now.rate)
+    assert now.rate[0] == 0.0 != now.rate[1]
 
 
 def test_draws_agree_with_what_is_chosen():
