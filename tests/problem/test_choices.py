@@ -264,6 +264,33 @@ def test_the_papers_own_flow_finds_a_start():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("window", [(0.3, 1.0), (0.9, 1.2)])
+def test_a_waypoint_is_passed_at_the_best_time_within_a_window(window):
+    """Back to -0.1 m, then to 1 m at rest after 2 s, with least effort."""
+    found = solve(
+        fastest(
+            horizon=[window, (0.5, 3.0)],
+            knots=[20, 20],
+            running_cost=lambda x, u, knot: knot.dt * u[0] ** 2,
+            equality=lambda x, u, knot: jnp.where(knot.index == 20, x[:1] + 0.1, 0.0),
+            terminal_equality=lambda x, knot: jnp.stack([x[0] - 1.0, x[1], knot.time - 2.0]),
+            u_bounds=(-20.0, 20.0),
+        ),
+        chains=4,
+    )
+
+    def effort(distance, v_0, v_1, T):  # of the cubic from end to end
+        return 12 * (distance - 0.5 * (v_0 + v_1) * T) ** 2 / T**3 + (v_1 - v_0) ** 2 / T
+
+    t, v = np.meshgrid(np.linspace(*window, 301), np.linspace(-1, 1, 801))
+    efforts = effort(-0.1, 0.0, v, t) + effort(1.1, v, 0.0, 2.0 - t)
+    best = efforts.argmin()
+    assert found.certified
+    assert found.cost.min() == pytest.approx(efforts.min(), rel=4e-3)
+    assert found.times[20] == pytest.approx(t.ravel()[best], abs=5e-3)
+
+
+@pytest.mark.slow
 def test_a_changed_model_is_saved_loaded_filmed_and_exported(tmp_path):
     problem = robot(
         horizon=(0.05, 0.4),
