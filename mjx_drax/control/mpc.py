@@ -246,8 +246,9 @@ class MPC:
                 "give fewer, or a longer tail."
             )
         polish = self.solver.polish
-        polished = polish is not None and polish.iterations and is_constrained(problem)
-        self._polish = replace(polish, iterations=ENDLESS) if polished else None
+        self._polish: Polish | None = None
+        if polish is not None and polish.iterations and is_constrained(problem):
+            self._polish = replace(polish, iterations=ENDLESS)
         self.chains, self.explorers = chains, int(explorers)
         self.iterations, self.every, self.seed = iterations, every, seed
         self.statistics = Statistics()
@@ -388,9 +389,9 @@ class MPC:
         scale = Scale(self._heated.scale.cost, number(np.sqrt(max(cost, 1e-12))))
         self._time = t  # of what is carried; the plan in use is older after one that failed
         problem, whole = self._at(t), np.append(np.asarray(x, number), self._further)
-        v = self._last_controls(t)
-        if v is not None:
-            problem = counted_from(problem, v)
+        if self._applied is not None:
+            v = self._applied.before(t, self._step)
+            problem = counted_from(problem, v, self._applied.any)
             whole[len(whole) - len(v) :] = v
         self._carried, device = _plan(
             self._flow,
@@ -418,11 +419,9 @@ class MPC:
 
     def _last_controls(self, t: float) -> np.ndarray | None:
         """Those before time t [s] that rates are counted from, (order * nu,); None without."""
-        dynamics = self.problem.dynamics
         if self._applied is None or not self._applied.any:
             return None
-        assert isinstance(dynamics, Extended)  # for the type checker
-        return self._applied.before(t, self._step, dynamics.order)
+        return self._applied.before(t, self._step)
 
     def _begin(self, t: float) -> None:
         """Forget what was applied; a free duration begins at time t [s]."""

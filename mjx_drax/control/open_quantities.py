@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -78,12 +79,12 @@ def with_time_passed(problem: Problem, passed: float) -> Problem:
     return replace(problem, bounds=replace(box, start_upper=box.start_upper.at[-1].set(most)))
 
 
-def counted_from(problem: Problem, v: np.ndarray) -> Problem:
-    """The problem with rates that are counted from the last controls (order * nu,)."""
+def counted_from(problem: Problem, v: np.ndarray, known: bool) -> Problem:
+    """The problem with rates that are counted from the last controls (order * nu,), if known."""
     dynamics = problem.dynamics
     assert isinstance(dynamics, Extended)  # for the type checker
-    u_init = v[: dynamics.nu].astype(problem.x_init.dtype)
-    return replace(problem, dynamics=replace(dynamics, u_init=u_init, starts_known=np.True_))
+    u_init: Any = v[: dynamics.nu].astype(problem.x_init.dtype)
+    return replace(problem, dynamics=replace(dynamics, u_init=u_init, starts_known=known))
 
 
 def driven(dynamics: Extended, x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -106,7 +107,7 @@ class Applied:
 
     def __init__(self, dynamics: Extended) -> None:
         """There are none yet, but for the problem's u_init."""
-        self._first = np.asarray(dynamics.u_init, float)
+        self._first, self._order = np.asarray(dynamics.u_init, float), dynamics.order
         self._given = [(-np.inf, self._first)] if dynamics.starts_known else []
 
     @property
@@ -120,13 +121,13 @@ class Applied:
         old = max(0, sum(time < since for time, _ in before) - 1)
         self._given = [*before[old:], (t, u)]
 
-    def before(self, t: float, step: float, count: int) -> np.ndarray:
-        """The last controls before the times t, t - step, ... [s], (count * nu,).
+    def before(self, t: float, step: float) -> np.ndarray:
+        """The last controls before the times t, t - step, ... [s], (order * nu,).
 
         Before the first control stands the first control.
         """
         given, found = self._given, [self._first]
-        for i in range(count):
+        for i in range(self._order):
             earlier = [u for time, u in given if time < t - i * step - 1e-9]
             found.append(earlier[-1] if earlier else found[-1])
         return np.concatenate(found[1:])

@@ -81,6 +81,8 @@ def _what_is_left(
     if not isinstance(dynamics, Extended) or not dynamics.phases:
         return knots.start, by, 1.0
     assert knots.start is not None  # for the type checker
+    assert problem.bounds.start_lower is not None
+    assert problem.bounds.start_upper is not None
     step = dynamics.nominal[-1] + knots.start[-1]
     by = by * dynamics.dt / step
     low, high = problem.bounds.start_lower[-1], problem.bounds.start_upper[-1]

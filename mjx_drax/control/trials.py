@@ -204,8 +204,7 @@ def _cost(policy: MPC, motion: Motion) -> float:
         x = driven(dynamics, np.append(x, further, axis=1), u)
         phases = (len(u),) * len(dynamics.phases)
         problem = replace(problem, dynamics=replace(dynamics, phases=phases))
-    x, u = jnp.asarray(x), jnp.asarray(u)
-    return float(jax.jit(_total)(problem, x[:-1], u, x[-1]))
+    return float(jax.jit(_total)(problem, *map(jnp.asarray, (x[:-1], u, x[-1]))))
 
 
 def _total(problem: Problem, x: jax.Array, u: jax.Array, end: jax.Array) -> jax.Array:

@@ -9,6 +9,7 @@ import pytest
 from builders import DT, K, double_integrator, robot
 
 from mjx_drax import MPC, DraxError, Restarts, from_function
+from mjx_drax.control import mpc
 from mjx_drax.control.open_quantities import Applied, driven, with_time_passed
 from mjx_drax.control.shift import shifted
 from mjx_drax.search.iterate import start
@@ -53,12 +54,12 @@ def test_the_last_controls_are_those_before_a_time():
     assert not given.any
     for k in range(20):
         given.add(np.array([float(k)]), k * DT / 2, since=(k - 6) * DT / 2)
-    np.testing.assert_array_equal(given.before(9.5 * DT, DT, 2), [18.0, 16.0])
+    np.testing.assert_array_equal(given.before(9.5 * DT, DT), [18.0, 16.0])
     assert len(given._given) < 10
     given.add(np.array([-1.0]), 5 * DT, since=0.0)  # time has gone back
-    np.testing.assert_array_equal(given.before(6 * DT, DT, 1), [-1.0])
+    np.testing.assert_array_equal(given.before(6 * DT, DT)[:1], [-1.0])
     known = Applied(limited().dynamics)
-    np.testing.assert_array_equal(known.before(0.0, DT, 1), [0.0])
+    np.testing.assert_array_equal(known.before(0.0, DT), [0.0])
 
 
 def test_what_was_driven_has_the_last_controls_and_steps():
@@ -135,13 +136,15 @@ def drive(policy, steps, dt, push=None):
 def test_rates_stay_within_their_bounds_from_control_to_control(every):
     problem = limited()
     policy = MPC(problem, chains=4, explorers=1, hold=1.0, every=every, solver=FAST)
-    x, u = np.zeros(2), [0.0]
+    policy.reset(np.zeros(2))
+    compiled, x, u = mpc._plan._cache_size(), np.zeros(2), [0.0]
     for k in range(60):
         u.append(policy(x, k * DT).item())
         x = x + DT * np.array([x[1], u[-1]]) + (np.array([0.1, -0.3]) if k == 20 else 0.0)
     assert np.abs(np.diff(u) / DT).max() < 4.0 + 1e-4
     np.testing.assert_allclose(x, GOAL, atol=0.02)
     assert max(policy.statistics.max_defects) < 1e-4
+    assert mpc._plan._cache_size() == compiled
 
 
 @pytest.mark.slow
