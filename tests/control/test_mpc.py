@@ -146,7 +146,7 @@ def test_between_plans_the_feedback_acts_about_the_interpolated_plan(policy):
 
 def test_what_is_not_finite_changes_nothing_and_is_counted(policy, monkeypatch):
     t, shifts, plan = DT, [], mpc._plan
-    monkeypatch.setattr(mpc, "_plan", lambda *a: shifts.append(float(a[5])) or plan(*a))
+    monkeypatch.setattr(mpc, "_plan", lambda *a: shifts.append(float(a[6])) or plan(*a))
     u = policy([np.nan, 0.0], t)
     np.testing.assert_allclose(u, policy.latest.u[1])
     assert policy.statistics.unmeasured == 1
