@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from mjx_drax.physics import curved
 from mjx_drax.physics._mjx import (
@@ -136,8 +136,9 @@ def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts
     """Distances (4 n,), positions (4 n, 3) and frames (4 n, 3, 3) of contacts of pairs (n, 2)."""
     plane, box = geom.T
     normal = data.geom_xmat[plane][:, None, :, 2]
+    corners = jnp.asarray(CORNERS, normal.dtype)
     from_centre = jnp.sum(
-        data.geom_xmat[box][:, None] * (CORNERS * model.geom_size[box][:, None])[:, :, None],
+        data.geom_xmat[box][:, None] * (corners * model.geom_size[box][:, None])[:, :, None],
         axis=-1,
     )
     corners = data.geom_xpos[box][:, None] + from_centre
@@ -209,13 +210,14 @@ def _around(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.n
 
 
 def hulls(model: mujoco.MjModel, which: Iterable[int]) -> dict[int, ConvexMesh]:
-    """The hulls of meshes, on the corners that the C engine has."""
+    """The hulls of meshes, on the corners that the C engine has; without those that are flat."""
     found = {}
     for mesh in which:
         graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
         corners = graph[2 + graph[0] : 2 + 2 * graph[0]]
         vertices = model.mesh_vert[model.mesh_vertadr[mesh] + corners]
-        found[mesh] = polytope(np.asarray(vertices, float))
+        with contextlib.suppress(QhullError):
+            found[mesh] = polytope(np.asarray(vertices, float))
     return found
 
 
@@ -239,10 +241,12 @@ def _unit_hull(kind: int) -> ConvexMesh:
 
 def _hull(kind: int, size: Array) -> ConvexMesh:
     """The hull that stands for a geom of a size (3,)."""
-    unit = _unit_hull(kind)
+    # Constants of its own for each precision: JAX may take one for the other
+    unit = jax.tree.map(lambda array: jnp.asarray(array, size.dtype), _unit_hull(kind))
+    unit = unit.replace(edge=_unit_hull(kind).edge)
     scale = size[jnp.array([0, 0, 1])] if kind == CYLINDER else size
 
-    def turned(normals: np.ndarray) -> Array:
+    def turned(normals: Array) -> Array:
         scaled = normals / scale
         return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
 

@@ -29,12 +29,13 @@ from jax import Array
 from mjx_drax.physics._mjx import ConvexMesh, four_of
 from mjx_drax.physics.engine import mujoco
 
-ANGLES = np.pi / 8 * np.arange(1, 16, 2)
-"""Where the C engine puts contacts on the rim of a cylinder that stands."""
+_ANGLES = np.pi / 8 * np.arange(1, 16, 2)
+CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+"""Where the C engine puts contacts on the rim of a cylinder that stands, (8, 2)."""
 
-STANDS, LIES = 0.985, 0.9999
-"""|cos| of the angle between axis and normal: above the first, contacts are on the end's rim (its
-angle to the surface is at most 10 degrees); below the second, on the lowest line of the side."""
+STANDS, LIES = 0.9954, 0.9999
+"""|cos| of the angle between axis and normal. Above the first (5.5 degrees) a cylinder stands on the
+rim of its end; below the second it touches at the lowest line of its side too, as in the C engine."""
 
 CORE, STEPS = 0.2, 12
 """How much smaller the core of a cylinder is than its smaller size; steps towards it."""
@@ -68,9 +69,8 @@ def cylinder(centre: Array, turn: Array, size: Array, hull: ConvexMesh) -> Conta
     normals, offsets = hull.face_normal, _offsets(hull)
     start, end = hull.vert[hull.edge[:, 0]], hull.vert[hull.edge[:, 1]]
     crossed = _unit(jnp.cross(end - start, axis))
-    crossed = (
-        crossed * jnp.sign(jnp.sum(crossed * hull.edge_face_normal.sum(axis=1), axis=1))[:, None]
-    )
+    outside = jnp.sum(crossed * hull.edge_face_normal.sum(axis=1), axis=1, keepdims=True)
+    crossed = crossed * jnp.sign(outside)
     few = jnp.stack([axis, -axis, _from_core(centre, turn, size, hull)])
     directions = jnp.concatenate([normals, crossed, few])
     highest = jnp.concatenate(
@@ -85,8 +85,7 @@ def cylinder(centre: Array, turn: Array, size: Array, hull: ConvexMesh) -> Conta
     # Points of the cylinder inside of the polytope: on the rim of the lower end, or of its side
     along = d @ axis
     below = centre - half * jnp.where(along < 0, -1.0, 1.0) * axis
-    circle = jnp.stack([jnp.cos(ANGLES), jnp.sin(ANGLES)], axis=1) @ turn[:, :2].T
-    rim = below + radius * circle
+    rim = below + radius * (jnp.asarray(CIRCLE, turn.dtype) @ turn[:, :2].T)
     side = centre - radius * _unit(_across(d, axis))
     line = _clipped(side - half * axis, side + half * axis, normals, offsets)
     own = jnp.concatenate([rim, line])

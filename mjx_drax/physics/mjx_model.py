@@ -71,7 +71,7 @@ def put_model(
         own = internal(on_device).mesh_convex
         found = hulls(model, [i for i, hull in enumerate(own) if hull is not None])
         on_device = on_device.tree_replace(
-            {"_impl.mesh_convex": tuple(found.get(i) for i in range(len(own)))}
+            {"_impl.mesh_convex": tuple(found.get(i, hull) for i, hull in enumerate(own))}
         )
         on_device = on_device.replace(geom_margin=model.geom_margin, pair_margin=model.pair_margin)
         if without:
