@@ -34,8 +34,8 @@ CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 """Where the C engine puts contacts on the rim of a cylinder that stands, (8, 2)."""
 
 STANDS, LIES = 0.9954, 0.9999
-"""|cos| of the angle between axis and normal. Above the first (5.5 degrees) a cylinder stands on the
-rim of its end; below the second it touches at the lowest line of its side too, as in the C engine."""
+"""|cos| of the angle between axis and normal. Above the first (5.5 degrees) a cylinder stands on
+the rim of its end; below the second it touches at the lowest line of its side too, as in C."""
 
 CORE, STEPS = 0.2, 12
 """How much smaller the core of a cylinder is than its smaller size; steps towards it."""
