@@ -16,6 +16,19 @@ from mjx_drax.cli.common import say
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The model, and the form of the report."""
     parser.add_argument("model", metavar="XML", help="MJCF file")
+    parser.add_argument(
+        "--contacts",
+        metavar="A:B",
+        action="append",
+        type=_pair,
+        help='geoms or bodies that may touch, such as "foot_*:floor"; may be given again',
+    )
+    parser.add_argument(
+        "--actuators",
+        metavar="KIND[=NUMBER]",
+        type=_actuators,
+        help="for a model without: torque, torque=LIMIT or position=KP",
+    )
     parser.add_argument("--json", action="store_true", help="the same as JSON")
 
 
@@ -25,6 +38,28 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.physics.report import check, text
 
     keep_programs()
-    report = check(options.model, lambda line: print(line, file=sys.stderr, flush=True))
+    report = check(
+        options.model,
+        lambda line: print(line, file=sys.stderr, flush=True),
+        options.contacts or True,
+        options.actuators,
+    )
     say(json.dumps(report, indent=1) if options.json else text(report))
     return 0 if report["obstacle"] is None else 1
+
+
+def _pair(text: str) -> tuple[str, str]:
+    """Two patterns."""
+    one, colon, other = text.partition(":")
+    if not (one and colon and other):
+        raise argparse.ArgumentTypeError(f"{text!r}: give two names and a colon, foot_*:floor")
+    return one, other
+
+
+def _actuators(text: str) -> str | dict[str, float]:
+    """What `from_mjcf` takes as actuators."""
+    kind, equals, number = text.partition("=")
+    try:
+        return {kind: float(number)} if equals else kind
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{number!r} is no number: give {kind}=10") from error

@@ -34,7 +34,9 @@ function may have a parameter `knot` besides (time, index, dt, data, parameters)
   u_init                   the control before the first knot
   data                     arrays with a row for each knot, or data(t); functions read knot.data
   guess(key) -> Trajectory initial knots of one chain
-  contacts                 how many contact points the plan keeps, the nearest ones; False: none
+  contacts                 how many contact points the plan keeps, the nearest ones; False: none;
+                           or the pairs that may touch, [("foot_*", "floor"), ...]
+  actuators                for a model without: "torque", {"torque": limit} or {"position": kp}
   derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin
 Other names are yours, but for those that are nearly one of these: they are taken for slips.

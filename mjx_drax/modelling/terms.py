@@ -30,6 +30,7 @@ from mjx_drax.modelling.hulls import HULL_DISTANCES, HULLS, MESH, hulls_of
 from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.source import index, load
 from mjx_drax.problem.cost import as_partial, at_knot, depends_on_knot
 from mjx_drax.problem.tracing import plain
@@ -121,14 +122,17 @@ class Terms:
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
+        actuators: as for `from_mjcf`, if the model gets them.
 
     Raises:
         DraxError: by every method, for a name that the model has not (listing those it has), a
             negative weight, numbers that are not finite, or of the wrong size.
     """
 
-    def __init__(self, model: str | Path | mujoco.MjModel) -> None:
-        self.model = load(model)
+    def __init__(
+        self, model: str | Path | mujoco.MjModel, actuators: Actuators | None = None
+    ) -> None:
+        self.model = load(model, actuators)
 
     def posture(
         self, target: str | ArrayLike | Mapping[str, ArrayLike], *, weight: ArrayLike = 1.0

@@ -15,6 +15,8 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     from mujoco import mjx as mjx
 
     # Not public: what MJX can collide, and how; frames of contacts; the law of constraint forces
+    from mujoco.mjx._src import collision_driver as collision_driver
+    from mujoco.mjx._src.collision_convex import _manifold_points as four_of  # noqa: F401
     from mujoco.mjx._src.collision_driver import (
         _COLLISION_FUNC as COLLISIONS,  # noqa: F401
     )
@@ -26,6 +28,7 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     )
     from mujoco.mjx._src.math import make_frame as make_frame
     from mujoco.mjx._src.solver import Context as ConstraintForces  # noqa: F401
+    from mujoco.mjx._src.types import ConvexMesh as ConvexMesh
 
 
 def internal(data: mjx.Data) -> Any:

@@ -27,6 +27,7 @@ from mjx_drax.physics.actuators import control_ranges, disabled
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, differences, free_ranges, put_model
+from mjx_drax.physics.pairs import Contacts
 from mjx_drax.physics.states import Engine, integrate, quiet, set_state
 
 SINGULAR = 1e-10
@@ -70,7 +71,10 @@ def _require_movable(model: mujoco.MjModel, name: str) -> None:
     if model.nv == 0:
         raise DraxError(f"{name} has no joints: there is nothing to move; add a <joint>.")
     if model.nu == 0:
-        raise DraxError(f"{name} has no actuators: add an <actuator> (to MJCF: a URDF has none).")
+        raise DraxError(
+            f'{name} has no actuators: give actuators="torque" or {{"position": kp}}, or add an '
+            "<actuator>."
+        )
     if disabled(model).all():
         raise DraxError(
             f"all actuators of {name} are disabled: clear the flag actuation and "
@@ -215,7 +219,7 @@ def samples(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int =
 def compare(
     model: mujoco.MjModel,
     at: Samples,
-    contacts: bool | int = True,
+    contacts: Contacts = True,
     bounded: np.ndarray | None = None,
     derivatives: bool = False,
 ) -> StepErrors:
@@ -289,7 +293,7 @@ def require_same_step(
     model: mujoco.MjModel,
     name: str,
     x_init: np.ndarray,
-    contacts: bool | int,
+    contacts: Contacts,
     bounded: np.ndarray,
 ) -> None:
     """Refuse or warn of a model that MJX is known to compute differently, if it does so.

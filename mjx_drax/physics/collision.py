@@ -1,47 +1,144 @@
-"""Contacts of MJX, with boxes on planes as MuJoCo's C engine has them.
+"""Contacts of MJX, with what it lacks.
 
-MJX makes contacts at the corners of a box that are within 1 mm of the lowest one. The C engine
-takes all corners of the lower half, so that a tilted box has more contacts there.
+- Boxes on planes have the contacts of MuJoCo's C engine. MJX makes contacts at the corners of a box
+  that are within 1 mm of the lowest one; the C engine takes all corners of the lower half, so that
+  a tilted box has more contacts there.
+- Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
+  points on them.
+- Two polytopes touch at every point once, where MJX repeats some.
+- Hulls of meshes have the normals of their faces; see `polytope`.
+- Pairs of geoms can be left out, by `exclude_signature` of the MJX model.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
+from collections.abc import Collection, Iterable, Iterator
+from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.spatial import ConvexHull, QhullError
 
-from mjx_drax.physics._mjx import COLLISIONS, make_frame, mjx
+from mjx_drax.physics import curved
+from mjx_drax.physics._mjx import (
+    COLLISIONS,
+    ConvexMesh,
+    collision_driver,
+    internal,
+    make_frame,
+    mjx,
+    with_internal,
+)
 from mjx_drax.physics.engine import mujoco
+
+_GEOM = mujoco.mjtGeom
+PLANE, HFIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
+    int(getattr(_GEOM, f"mjGEOM_{kind}"))
+    for kind in ("PLANE", "HFIELD", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
+)
+
+SIDES = 16
+"""Sides of the prism that stands for a cylinder. The C engine lets cylinders stand on 8 points at
+odd multiples of 22.5 degrees, which are corners of it."""
+
+MOST_CORNERS = 20
+"""Corners of a face, at most, as in MJX; from larger faces every second or third is taken."""
+
+SAME = 1e-6
+"""How close two contacts of one pair are the same one [m]."""
+
+POINTS = 66
+"""Points on the hull that stands for an ellipsoid: six, and edges halved twice."""
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """The corners of a cube, (8, 3)."""
 
-_PLANE_BOX = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)
-_ONE_AT_A_TIME = threading.Lock()
+_ONE_AT_A_TIME = threading.RLock()
+_MJX_PLANE_MESH = COLLISIONS[PLANE, MESH]
+
+BLIND = np.zeros((9, 9), bool)
+"""Kinds of geoms, the lower one first, whose distance MJX knows only where they overlap."""
+BLIND[:, MESH] = BLIND[HFIELD] = True
+BLIND[[PLANE, ELLIPSOID, CYLINDER], MESH] = False
+
+Pairs = Collection[tuple[int, int]]
+Contacts = tuple[Array, Array, Array]
+
+
+@contextlib.contextmanager
+def extended(left_out: Pairs = ()) -> Iterator[None]:
+    """Inside of this, MJX collides what is listed above.
+
+    MJX has one table of functions for all threads, so one thread at a time does this; the table is
+    restored.
+
+    Args:
+        left_out: pairs of geoms, beside those that an MJX model leaves out itself.
+    """
+    with _ONE_AT_A_TIME:
+        table, pairs = dict(COLLISIONS), collision_driver.geom_pairs
+
+        def kept(model: Any) -> Iterator[tuple[int, int, int]]:
+            out = {signature(*pair) for pair in left_out}
+            out |= {int(s) for s in model.exclude_signature if s < 0}
+            yield from (pair for pair in pairs(model) if signature(*pair[:2]) not in out)
+
+        COLLISIONS.update(_OWN)
+        collision_driver.geom_pairs = kept
+        try:
+            yield
+        finally:
+            COLLISIONS.clear()
+            COLLISIONS.update(table)
+            collision_driver.geom_pairs = pairs
+
+
+def signature(a: int, b: int) -> int:
+    """The entry of `exclude_signature` that leaves out a pair of geoms; MuJoCo's are positive."""
+    low, high = sorted((int(a), int(b)))
+    return -((low << 24) + high) - 1
+
+
+def left_out(model: mjx.Model) -> set[tuple[int, int]]:
+    """The pairs of geoms that an MJX model leaves out."""
+    codes = (-(int(s) + 1) for s in model.exclude_signature if s < 0)
+    return {(code >> 24, code & 0xFFFFFF) for code in codes}
+
+
+def make_data(model: mjx.Model) -> mjx.Data:
+    """`mjx.make_data`: room for all contacts."""
+    with extended():
+        return mjx.make_data(model)
 
 
 def collision(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.collision`: `data` with all contacts."""
-    with _ONE_AT_A_TIME:  # MJX has one table of functions for all threads; it is restored
-        before = COLLISIONS[_PLANE_BOX]
-        COLLISIONS[_PLANE_BOX] = plane_box
-        try:
-            return mjx.collision(model, data)
-        finally:
-            COLLISIONS[_PLANE_BOX] = before
+    """`mjx.collision`: `data` with all contacts.
+
+    Where MJX finds no distances of geoms that are apart, contacts have no margin.
+    """
+    with extended():
+        data = mjx.collision(model, data)
+    contact, kinds = internal(data).contact, jnp.asarray(model.geom_type)
+    if not np.isin(model.geom_type, (HFIELD, MESH)).any() or not contact.dist.size:
+        return data
+    blind = jnp.asarray(BLIND)[kinds[contact.geom[:, 0]], kinds[contact.geom[:, 1]]]
+    margin = jnp.where(blind, 0.0, contact.includemargin)
+    return with_internal(data, contact=contact.replace(includemargin=margin))
 
 
-def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> tuple[Array, Array, Array]:
+def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts:
     """Distances (4 n,), positions (4 n, 3) and frames (4 n, 3, 3) of contacts of pairs (n, 2)."""
     plane, box = geom.T
     normal = data.geom_xmat[plane][:, None, :, 2]
+    corners = jnp.asarray(CORNERS, normal.dtype)
     from_centre = jnp.sum(
-        data.geom_xmat[box][:, None] * (CORNERS * model.geom_size[box][:, None])[:, :, None],
+        data.geom_xmat[box][:, None] * (corners * model.geom_size[box][:, None])[:, :, None],
         axis=-1,
     )
     corners = data.geom_xpos[box][:, None] + from_centre
@@ -54,3 +151,194 @@ def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> tuple[Ar
 
 
 plane_box.ncon = 4  # type: ignore[attr-defined]  # contacts of a pair, which MJX reads
+
+
+def plane_mesh(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
+    """The same of meshes, as MJX makes them, which takes corners below a plane only.
+
+    The plane is raised by 1 m, so that corners within a margin above it count as well.
+    """
+    up = data.geom_xmat[..., 2]
+    raised = data.replace(geom_xpos=data.geom_xpos.at[geom[:, 0]].add(up[geom[:, 0]]))
+    dist, pos, frame = _MJX_PLANE_MESH(model, raised, key, geom)
+    acts = dist < 0
+    return jnp.where(acts, dist + 1.0, 1.0), pos - 0.5 * acts[:, None] * frame[:, 0], frame
+
+
+plane_mesh.ncon = 4  # type: ignore[attr-defined]
+
+
+def polytope(points: np.ndarray) -> ConvexMesh:
+    """The convex hull of points (n, 3), as MJX has it of a mesh.
+
+    MJX itself merges triangles that are nearly in a plane, and leaves out corners of large faces
+    before it finds their normals: of 276 meshes of robots, 221 had a corner outside of a face, by
+    more than 1/1000 of their size.
+    """
+    size = np.abs(points).max()
+    hull = ConvexHull(points / size)
+    planes: dict[tuple[float, ...], list[int]] = {}
+    for t, plane in enumerate(hull.equations):
+        planes.setdefault(tuple((plane + 0.0).round(5) + 0.0), []).append(t)
+    normals = np.array([hull.equations[same[0], :3] for same in planes.values()])
+    faces = [
+        _around(points, np.unique(hull.simplices[same]), normal)
+        for same, normal in zip(planes.values(), normals, strict=True)
+    ]
+    beside: dict[tuple[int, int], list[int]] = {}
+    for f, face in enumerate(faces):
+        for pair in zip(face, np.roll(face, -1), strict=True):
+            beside.setdefault((int(min(pair)), int(max(pair))), []).append(f)
+    beside = {pair: both for pair, both in beside.items() if len(both) == 2}
+    faces = [face[:: -(-len(face) // MOST_CORNERS)] for face in faces]
+    most = max(map(len, faces))
+    padded = np.array([np.pad(face, (0, most - len(face)), "edge") for face in faces])
+    return ConvexMesh(
+        points,
+        points[padded],
+        normals,
+        np.array(list(beside)),
+        normals[np.array(list(beside.values()))],
+    )
+
+
+def _around(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Corners of a face in counterclockwise order about its normal."""
+    out = points[corners] - points[corners].mean(axis=0)
+    angle = np.arctan2(np.cross(out[0], out) @ normal, out @ out[0])
+    return corners[np.argsort(angle)]
+
+
+def hulls(model: mujoco.MjModel, which: Iterable[int]) -> dict[int, ConvexMesh]:
+    """The hulls of meshes, on the corners that the C engine has; without those that are flat."""
+    found = {}
+    for mesh in which:
+        graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
+        corners = graph[2 + graph[0] : 2 + 2 * graph[0]]
+        vertices = model.mesh_vert[model.mesh_vertadr[mesh] + corners]
+        with contextlib.suppress(QhullError):
+            found[mesh] = polytope(np.asarray(vertices, float))
+    return found
+
+
+@cache
+def _unit_hull(kind: int) -> ConvexMesh:
+    """A hull for geoms of size 1."""
+    points = CORNERS
+    if kind == CYLINDER:
+        angle = 2 * np.pi * np.arange(SIDES) / SIDES
+        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        points = np.concatenate([np.insert(circle, 2, z, axis=1) for z in (-1.0, 1.0)])
+    elif kind == ELLIPSOID:
+        points = np.concatenate([np.eye(3), -np.eye(3)])
+        while len(points) < POINTS:
+            triangles = points[ConvexHull(points).simplices]
+            halves = (triangles + np.roll(triangles, 1, axis=1)).reshape(-1, 3)
+            halves /= np.linalg.norm(halves, axis=1, keepdims=True)
+            points = np.unique(np.concatenate([points, halves]).round(12), axis=0)
+    return polytope(points)
+
+
+def _hull(kind: int, size: Array) -> ConvexMesh:
+    """The hull that stands for a geom of a size (3,)."""
+    # Constants of its own for each precision: JAX may take one for the other
+    unit = jax.tree.map(lambda array: jnp.asarray(array, size.dtype), _unit_hull(kind))
+    unit = unit.replace(edge=_unit_hull(kind).edge)
+    scale = size[jnp.array([0, 0, 1])] if kind == CYLINDER else size
+
+    def turned(normals: Array) -> Array:
+        scaled = normals / scale
+        return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
+
+    return ConvexMesh(
+        unit.vert * scale,
+        unit.face * scale,
+        turned(unit.face_normal),
+        unit.edge,
+        turned(unit.edge_face_normal),
+    )
+
+
+def on_height_field(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
+    """Distances (4 n,), positions (4 n, 3), frames (4 n, 3, 3) of contacts of pairs (n, 2)."""
+    field, kind = key.types
+
+    def of_pair(pair: Array) -> Contacts:
+        hulls = *model._impl.mesh_convex, _hull(int(kind), model.geom_size[pair[1]])
+        # MJX looks for cells of the field within the largest size of a hull
+        sizes = jnp.tile(model.geom_rbound[:, None], 3)
+        with_hull = model.tree_replace({"_impl.mesh_convex": hulls, "geom_size": sizes})
+        ids = key.data_ids[0], len(hulls) - 1
+        as_mesh = type(key)((field, MESH), ids, key.condim, key.subgrid_size)
+        found: Contacts = COLLISIONS[HFIELD, MESH](with_hull, data, as_mesh, pair[None])
+        return found
+
+    dist, pos, frame = jax.vmap(of_pair)(geom)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
+
+
+on_height_field.ncon = 4  # type: ignore[attr-defined]
+
+
+def with_corners(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
+    """The same of cylinders with boxes and meshes, and (n,), ... of ellipsoids with them."""
+    smooth, cornered = (int(kind) for kind in key.types)
+
+    def of_pair(pair: Array) -> Contacts:
+        one, other = pair
+        mesh = model._impl.mesh_convex[key.data_ids[1]] if cornered == MESH else None
+        hull = _hull(BOX, model.geom_size[other]) if mesh is None else mesh
+        turn, origin = data.geom_xmat[other], data.geom_xpos[other]
+        centre = turn.T @ (data.geom_xpos[one] - origin)
+        between = curved.CONTACTS[smooth]
+        dist, pos, normal = between(
+            centre, turn.T @ data.geom_xmat[one], model.geom_size[one], hull
+        )
+        frame = jnp.repeat(make_frame(turn @ normal)[None], len(dist), axis=0)
+        return dist, pos @ turn.T + origin, frame
+
+    dist, pos, frame = jax.vmap(of_pair)(geom)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
+
+
+def _distinct(collide: Any) -> Any:
+    """MJX's function of two polytopes, with no contact twice.
+
+    Where fewer than four corners overlap MJX repeats some of them, and contacts push as often.
+    """
+
+    def function(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
+        dist, pos, frame = collide(model, data, key, geom)
+        four = pos.reshape(-1, 4, 3)
+        same = jnp.max(jnp.abs(four[:, :, None] - four[:, None]), axis=-1) < SAME
+        again = jnp.any(jnp.tril(same, -1) & (dist.reshape(-1, 1, 4) < 0), axis=2)
+        return jnp.where(again.reshape(-1), curved.APART, dist), pos, frame
+
+    return _function(function, 4)
+
+
+def _function(collide: Any, contacts: int) -> Any:
+    """A function that says, as MJX reads it, how many contacts it makes of a pair."""
+
+    def function(*arguments: Any) -> Contacts:
+        found: Contacts = collide(*arguments)
+        return found
+
+    function.ncon = contacts  # type: ignore[attr-defined]
+    return function
+
+
+_CYLINDERS, _ELLIPSOIDS = _function(with_corners, 4), _function(with_corners, 1)
+
+_OWN = {
+    (PLANE, BOX): plane_box,
+    (PLANE, MESH): plane_mesh,
+    (HFIELD, ELLIPSOID): on_height_field,
+    (HFIELD, CYLINDER): on_height_field,
+    (ELLIPSOID, BOX): _ELLIPSOIDS,
+    (ELLIPSOID, MESH): _ELLIPSOIDS,
+    (CYLINDER, BOX): _CYLINDERS,
+    (CYLINDER, MESH): _CYLINDERS,
+    **{pair: _distinct(COLLISIONS[pair]) for pair in ((BOX, BOX), (BOX, MESH), (MESH, MESH))},
+}
+"""Kinds of geoms, the lower one first, and what collides them in place of MJX."""

@@ -25,10 +25,12 @@ from mjx_drax.base.pytrees import HostOnly
 from mjx_drax.kernels.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
+from mjx_drax.physics.collision import left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
 from mjx_drax.physics.observed import Observed
+from mjx_drax.physics.pairs import Contacts, contact_pairs
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.physics.states import difference, integrate, set_state
 from mjx_drax.physics.stepper import Stepper
@@ -247,10 +249,17 @@ class MjxDynamics(Dynamics):
         return KINKED_STATE_DAMPING if self.kinked else 1.0
 
     @property
-    def contacts(self) -> bool | int:
-        """Whether the plan has contacts, or how many of each friction dimension it keeps."""
+    def contacts(self) -> Contacts:
+        """Whether the plan has contacts, or how many of each friction dimension it keeps.
+
+        Where pairs are left out: the pairs of geoms, by their numbers, that it has contacts of.
+        """
         if int(self.model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT):
             return False
+        without = left_out(self.model)
+        if without:
+            every = contact_pairs(self.mj_model)
+            return [pair for pair in every if (min(pair), max(pair)) not in without]
         points = kept_contacts(self.model)
         return True if points is None else points
 

@@ -25,6 +25,9 @@ from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, Joints
 from mjx_drax.physics.mjx_model import free_ranges, kept_contacts, put_model
+from mjx_drax.physics.motors import Actuators
+from mjx_drax.physics.near import affordable
+from mjx_drax.physics.pairs import Contacts
 from mjx_drax.physics.source import load, model_name, origin_of
 from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
 from mjx_drax.problem.choices import Choices, parameter_ends, phases_of
@@ -54,7 +57,8 @@ def from_mjcf(
     u_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
-    contacts: bool | int = True,
+    contacts: Contacts = True,
+    actuators: Actuators | None = None,
     derivatives: Differentiator | None = None,
     x_init_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     parameters: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
@@ -103,9 +107,15 @@ def from_mjcf(
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the
-            nearest ones in every state. True keeps at most 32. False plans as if nothing could
-            touch, which is right where constraints keep bodies apart. The C engine that certifies
-            keeps all contacts.
+            nearest ones in every state. True keeps at most 32, and where meshes have too many
+            corners only those of pairs that come closest in motions from x_init (a warning says
+            so). False plans as if nothing could touch, which is right where constraints keep bodies
+            apart. Or the pairs that may touch, [("foot_*", "floor"), ...]: names of geoms or
+            bodies, * stands for any characters. The C engine that certifies keeps all contacts.
+        actuators: for a model that has none, one for each hinge and slide. "torque": motors with
+            the limits that joints give by actuatorfrcrange; {"torque": limit} also where they give
+            none [N m, N]. {"position": kp}: servos with this gain, critically damped. Numbers
+            differ by joint with {pattern of joint names: number}.
         derivatives: of f; by default exact, also in contact. `Smoothed()` fits them to samples,
             which feel a contact that is as far away as the samples are spread.
         x_init_bounds: (lower, upper) of x_0, which is free where they differ; `knot.x_init`
@@ -144,7 +154,7 @@ def from_mjcf(
     require_functions(**given, goal=goal, guess=guess)
     if derivatives is not None:
         require_part("derivatives", derivatives, "jacobian", "Smoothed()")
-    mj_model = load(model)
+    mj_model = load(model, actuators)
     name = model_name(mj_model) if name is None else name
     require_name(name)
     substeps = steps_between_knots(mj_model, dt)
@@ -158,7 +168,8 @@ def from_mjcf(
     K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
     x0, bounded = checked_start(mj_model, name, x_init)
     warn_of_start_beyond_limits(mj_model, name, x0)
-    planned, origin = put_model(mj_model, contacts, bounded), origin_of(model)
+    contacts = affordable(mj_model, name, x0, bounded, contacts)
+    planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
     require_traceable(mj_model, name, dynamics.observe)
     names = fields_of(dynamics, parameters, model_numbers)

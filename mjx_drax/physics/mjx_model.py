@@ -9,17 +9,19 @@ names those that a model has. All others are found by the certificate.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+import warnings
 from typing import Any
 
 import jax
 import numpy as np
 
-from mjx_drax.base.errors import DraxError, shown
-from mjx_drax.physics._mjx import geom_pairs, has_collision_fn, internal, mjx
+from mjx_drax.base.errors import DraxError
+from mjx_drax.physics._mjx import COLLISIONS, geom_pairs, internal, mjx
 from mjx_drax.physics.actuators import disabled, driven
+from mjx_drax.physics.collision import extended, hulls, make_data, signature
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
+from mjx_drax.physics.pairs import Contacts, Pair, contact_pairs, geom_name, left_out
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
@@ -31,38 +33,54 @@ MOST_CONTACTS = 32
 """Contact points of each friction dimension (condim) that a plan keeps by default: as many as eight
 boxes on the floor have. A step with half as many takes as long."""
 
+SLIPPERY = 1e-7
+"""Friction of contacts that have none; with MuJoCo's least, 1e-5, a velocity was off by 7e-4."""
+
 _LIMIT = "max_contact_points"
 """The custom number of a model that tells MJX how many contact points to keep."""
 
 
 def put_model(
-    model: mujoco.MjModel, contacts: bool | int = True, bounded: np.ndarray | None = None
+    model: mujoco.MjModel, contacts: Contacts = True, bounded: np.ndarray | None = None
 ) -> mjx.Model:
     """The MJX model of a MuJoCo model.
 
     Args:
         model: which is not changed.
         contacts: False leaves contacts out; a number keeps so many contact points of each friction
-            dimension (condim), the nearest ones in every state; True keeps `MOST_CONTACTS`.
+            dimension (condim), the nearest ones in every state; True keeps `MOST_CONTACTS`, and so
+            do pairs of names, of the contacts between these geoms or bodies.
         bounded: joints whose ranges are bounds of the knots, (njnt,). Inside of its range the force
             of a limit is zero, so its constraint row is left out; the C engine keeps it.
 
     Raises:
         DraxError: MJX does not support the model; says what and what to do.
     """
-    if contacts is not True and not (isinstance(contacts, int | np.integer) and contacts >= 0):
-        raise DraxError(f"contacts is {shown(contacts)}: give True, False or a whole number.")
+    without = left_out(model, contacts)
     supported = copy.deepcopy(model)
     if bounded is not None:
         supported.jnt_limited[bounded] = 0
     if not contacts:
         supported.opt.disableflags |= int(_DISABLE.mjDSBL_CONTACT)
-    _make_supported(supported)
+        without = set()
+    _make_supported(supported, without)
     try:
-        on_device = mjx.put_model(supported, device=jax.local_devices()[0], impl="jax")
+        with extended(without), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large faces of hulls, which are replaced
+            on_device = mjx.put_model(supported, device=jax.local_devices()[0], impl="jax")
+        own = internal(on_device).mesh_convex
+        found = hulls(model, [i for i, hull in enumerate(own) if hull is not None])
+        on_device = on_device.tree_replace(
+            {"_impl.mesh_convex": tuple(found.get(i, hull) for i, hull in enumerate(own))}
+        )
+        on_device = on_device.replace(geom_margin=model.geom_margin, pair_margin=model.pair_margin)
+        if without:
+            signatures = sorted(signature(*pair) for pair in without)
+            excluded = np.append(on_device.exclude_signature, signatures)
+            on_device = on_device.replace(exclude_signature=excluded)
         on_device = _with_contact_limit(on_device, contacts)
     except (NotImplementedError, ValueError) as error:
-        raise DraxError(_refusal(supported, str(error))) from error
+        raise DraxError(_refusal(supported, without, str(error))) from error
     if not model.nmat:  # MJX's rangefinders read materials, also where there are none
         on_device = on_device.replace(mat_rgba=np.ones((1, 4), np.float32))
     # MJX commits its arrays to a device, and so all that is computed from them. A loop that gets
@@ -72,14 +90,18 @@ def put_model(
     return placed
 
 
-def _with_contact_limit(model: mjx.Model, contacts: bool | int) -> mjx.Model:
+def _with_contact_limit(model: mjx.Model, contacts: Contacts) -> mjx.Model:
     """The model, told to keep only the nearest contact points if it has more than it should.
 
     MJX reads how many to keep from a custom number of the model. It is added here, not in the MJCF,
     because a model may come compiled. MJX's other number, `max_geom_pairs`, is not used: MJX then
     chooses pairs of geoms by their bounding spheres, before it knows distances, and loses contacts.
     """
-    points = MOST_CONTACTS if contacts is True else int(contacts)
+    points = (
+        int(contacts)
+        if isinstance(contacts, int | np.integer) and contacts is not True
+        else MOST_CONTACTS
+    )
     if np.bincount(contact_points(model), minlength=1).max() <= points:
         return model
     return model.replace(
@@ -103,8 +125,13 @@ def _with_springs(model: mjx.Model) -> mjx.Model:
     return model.replace(tendon_lengthspring=np.stack([lower, upper], axis=1))
 
 
-def _make_supported(model: mujoco.MjModel) -> None:
-    """Change a model into one that MJX supports and that moves alike, up to `differences`."""
+def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
+    """Change a model into one that MJX supports and that moves alike, up to `differences`.
+
+    Args:
+        model: to change.
+        without: pairs of geoms that are left out.
+    """
     opt = model.opt
     opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # the inertia as `tree` computes it
     opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all solvers find the same minimum
@@ -125,10 +152,14 @@ def _make_supported(model: mujoco.MjModel) -> None:
         # Otherwise MJX refuses geoms that it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
-    touching = next(geom_pairs(model), None) is not None
+    touching = _pairs(model, without)
     if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
         # No contact has friction, and MJX fails if elliptic cones are asked for and there are none
         opt.cone = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
+    if opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        _give_cones(model, touching)
+    # MJX refuses margins of meshes and height fields; `put_model` and `collision` care for them
+    model.geom_margin[:], model.pair_margin[:] = 0.0, 0.0
     if not touching:  # MJX fails in these sensors, because there is no array of contacts
         touch = np.isin(model.sensor_type, [int(kind) for kind in _TOUCHED])
         model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
@@ -136,6 +167,36 @@ def _make_supported(model: mujoco.MjModel) -> None:
     model.actuator_biasprm[disabled(model)] = 0.0
     # These sensors are named in `differences`
     model.sensor_type[_unknown_sensors(model)] = int(mujoco.mjtSensor.mjSENS_CLOCK)
+
+
+def _pairs(model: mujoco.MjModel, without: set[Pair]) -> list[tuple[int, int, int]]:
+    """Pairs of geoms that a plan has contacts of, each with the number of its <pair>, or -1."""
+    return [(int(a), int(b), int(i)) for a, b, i in geom_pairs(model) if (a, b) not in without]
+
+
+def _condim(model: mujoco.MjModel, a: int, b: int, pair: int) -> int:
+    """The friction dimension of the contacts of two geoms."""
+    if pair >= 0:
+        return int(model.pair_dim[pair])
+    priority, own = model.geom_priority[[a, b]], model.geom_condim[[a, b]]
+    return int(own.max() if priority[0] == priority[1] else own[priority.argmax()])
+
+
+def _give_cones(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
+    """Give contacts without friction (condim 1) a cone, of almost no friction.
+
+    MJX lacks them among elliptic cones. The friction of a contact is the larger one of its two
+    geoms, so that friction is lost where such a geom has more of it than another one that it meets
+    with friction; a step then differs.
+    """
+    for a, b, pair in pairs:
+        if _condim(model, a, b, pair) == 1:
+            if pair >= 0:
+                model.pair_friction[pair] = SLIPPERY
+            else:
+                model.geom_friction[[a, b]] = SLIPPERY
+    model.geom_condim[model.geom_condim == 1] = 3
+    model.pair_dim[model.pair_dim == 1] = 3
 
 
 def _unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
@@ -148,12 +209,10 @@ def _unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
     return unknown | refused & (model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
 
 
-def _refusal(model: mujoco.MjModel, reason: str) -> str:
+def _refusal(model: mujoco.MjModel, without: set[Pair], reason: str) -> str:
     """What MJX said, with the elements that it means and what to do about them."""
-    if "collisions not implemented" in reason or "margin/gap" in reason:
-        return _not_collided(model)
-    if "condim" in reason.lower() or "ELLIPTIC" in reason:
-        return f'{reason}: set <option cone="pyramidal"/>, or condim="3" on all geoms.'
+    if "collisions not implemented" in reason:
+        return _not_collided(model, without)
     if "fluid drag" in reason:
         return (
             f'{reason.rstrip(".")}: set <option integrator="Euler"/>, or no density and viscosity.'
@@ -172,57 +231,23 @@ def _refusal(model: mujoco.MjModel, reason: str) -> str:
     return f"MJX does not support this model: {reason}"
 
 
-def _not_collided(model: mujoco.MjModel) -> str:
+def _not_collided(model: mujoco.MjModel, without: set[Pair]) -> str:
     """All that MJX cannot collide: of each two types of geoms one pair, and how many there are."""
-    types: dict[tuple[str, str], list[str]] = {}
-    margins: dict[tuple[str, str], list[str]] = {}
-    for a, b, pair in geom_pairs(model):
-        one, other = (_GEOM(model.geom_type[g]).name[len("mjGEOM_") :].lower() for g in (a, b))
-        margin = model.pair_margin[pair] if pair >= 0 else model.geom_margin[[a, b]].sum()
-        if not has_collision_fn(*model.geom_type[[a, b]]):
-            found = types
-        elif margin and {"mesh", "hfield"} & {one, other}:
-            found = margins
-        else:
-            continue
-        names = f"{geom_name(model, a)!r} and {geom_name(model, b)!r}"
-        found.setdefault((one, other), []).append(names)
-
-    def listed(found: dict[tuple[str, str], list[str]]) -> str:
-        counts = {
-            k: f", one of {len(v)} such pairs" if len(v) > 1 else "" for k, v in found.items()
-        }
-        return ", ".join(f"{v[0]} ({k[0]} with {k[1]}{counts[k]})" for k, v in found.items())
-
-    reasons = []
-    if types:
-        odd = sorted({kind for kinds in types for kind in kinds} & {"cylinder", "ellipsoid", "sdf"})
-        reasons.append(
-            f"cannot collide geoms {listed(types)}: make each {' and '.join(odd)} among them a "
-            "capsule, sphere, box or mesh"
-        )
-    if margins:
-        reasons.append(
-            "knows no margins of meshes and height fields, "
-            f'here of geoms {listed(margins)}: set margin="0" on both'
-        )
+    found: dict[tuple[str, str], list[str]] = {}
+    with extended():
+        known = set(COLLISIONS)
+    for a, b, _ in _pairs(model, without):
+        types = int(model.geom_type[a]), int(model.geom_type[b])
+        if types not in known:
+            one, other = (_GEOM(kind).name[len("mjGEOM_") :].lower() for kind in types)
+            names = f"{geom_name(model, a)!r} and {geom_name(model, b)!r}"
+            found.setdefault((one, other), []).append(names)
+    counts = {k: f", one of {len(v)} such pairs" if len(v) > 1 else "" for k, v in found.items()}
+    listed = ", ".join(f"{v[0]} ({k[0]} with {k[1]}{counts[k]})" for k, v in found.items())
     return (
-        f"MJX {', and '.join(reasons)}; or keep them apart by contype and conaffinity, or plan "
-        "with contacts=False."
+        f"MJX cannot collide geoms {listed}: make them capsules, spheres, boxes or meshes, choose "
+        "other pairs by contacts=[...], or plan with contacts=False."
     )
-
-
-def geom_name(model: mujoco.MjModel, g: int) -> str:
-    """A geom's name, or its number and body."""
-    geom = model.geom(g)
-    body = int(geom.bodyid[0])
-    return str(geom.name or f"geom {g} of body {model.body(body).name or body}")
-
-
-def contact_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
-    """All pairs of geoms between which MuJoCo may make a contact; the lower type comes first."""
-    if not model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
-        yield from ((int(a), int(b)) for a, b, _ in geom_pairs(model))
 
 
 _OTHER_CONTACTS = {
@@ -232,12 +257,14 @@ _OTHER_CONTACTS = {
         *("SPHERE CYLINDER", "CAPSULE CYLINDER", "ELLIPSOID CYLINDER", "CYLINDER CYLINDER"),
         *("SPHERE ELLIPSOID", "CAPSULE ELLIPSOID", "ELLIPSOID ELLIPSOID"),
         *("HFIELD SPHERE", "HFIELD CAPSULE", "HFIELD BOX", "HFIELD MESH"),
+        *("HFIELD ELLIPSOID", "HFIELD CYLINDER", "ELLIPSOID BOX", "ELLIPSOID MESH"),
+        *("CYLINDER BOX", "CYLINDER MESH"),
     )
 }
 """Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 1."""
 
 
-def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]:
+def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[str]:
     """What MJX computes differently from the C engine in this model, a sentence each.
 
     Found by comparing one step of both in many models: each changed velocities by 2e-5 to 0.7.
@@ -284,7 +311,7 @@ def differences(model: mujoco.MjModel, contacts: bool | int = True) -> list[str]
         f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs"
         for i in np.flatnonzero(_unknown_sensors(model))
     ]
-    pairs = contact_pairs(model) if contacts else iter(())
+    pairs = sorted(set(contact_pairs(model)) - left_out(model, contacts))
     for a, b in pairs:
         if (int(model.geom_type[a]), int(model.geom_type[b])) in _OTHER_CONTACTS:
             found.append(
@@ -318,7 +345,7 @@ def has_constraints(model: mjx.Model) -> bool:
 
 def _data_of(model: mjx.Model) -> mjx.Data:
     """The data of a model: shapes, and what depends on no state."""
-    return jax.eval_shape(mjx.make_data, model)
+    return jax.eval_shape(make_data, model)
 
 
 def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -22,12 +22,14 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjcf import steps_between_knots
 from mjx_drax.physics.mjx_model import (
     constraint_rows,
-    contact_pairs,
     contact_points,
     differences,
     kept_contacts,
     put_model,
 )
+from mjx_drax.physics.motors import Actuators
+from mjx_drax.physics.near import affordable
+from mjx_drax.physics.pairs import Contacts, contact_pairs
 from mjx_drax.physics.source import load, model_name
 from mjx_drax.physics.states import Engine
 
@@ -35,13 +37,17 @@ Report = dict[str, Any]
 
 
 def check(
-    source: str | Path | mujoco.MjModel, progress: Callable[[str], None] = lambda line: None
+    source: str | Path | mujoco.MjModel,
+    progress: Callable[[str], None] = lambda line: None,
+    contacts: Contacts = True,
+    actuators: Actuators | None = None,
 ) -> Report:
     """What `mjx-drax check` prints, as numbers and words that JSON can hold.
 
     Args:
         source: MJCF file, XML string or `mujoco.MjModel`.
         progress: called with a line before what takes long.
+        contacts, actuators: as for `from_mjcf`.
 
     Returns:
         `sizes`, `timing`, `joints`, `actuators`, `contact_pairs`, `contact_points` (`all`, those
@@ -52,7 +58,7 @@ def check(
     Raises:
         DraxError: the file is missing or MuJoCo cannot compile it.
     """
-    model = load(source)
+    model = load(source, actuators)
     name = model_name(model)
     steps = steps_between_knots(model, None)
     report: Report = {
@@ -74,14 +80,16 @@ def check(
         "actuators": [_actuator(model, a) for a in range(model.nu)],
         "contact_pairs": sum(1 for _ in contact_pairs(model)),
         "contact_points": {"all": None, "kept": None, "nearest": None},
-        "differences": differences(model),
+        "differences": [],
         "agreement": None,
         "obstacle": None,
     }
     try:
         x_init, bounded = checked_start(model, name)
         report["joints"] = _joints(model, bounded)
-        planned = put_model(model, bounded=bounded)
+        contacts = affordable(model, name, x_init, bounded, contacts)
+        report["differences"] = differences(model, contacts)
+        planned = put_model(model, contacts, bounded)
         report["sizes"]["constraint_rows"] = constraint_rows(planned)
         report["contact_points"] = {
             "all": len(contact_points(put_model(model, np.iinfo(int).max))),
@@ -91,16 +99,18 @@ def check(
         progress(f"{name}: compiling one step of MJX and its derivatives ...")
         dynamics = MjxDynamics(planned, report["timing"]["dt"], model, steps)
         require_traceable(model, name, dynamics.observe)
-        report["agreement"] = _agreement(model, x_init, bounded)
+        report["agreement"] = _agreement(model, x_init, contacts, bounded)
         require_small_error(name, report["agreement"]["velocity_error"], report["differences"])
     except DraxError as error:
         report["obstacle"] = str(error)
     return report
 
 
-def _agreement(model: mujoco.MjModel, x_init: np.ndarray, bounded: np.ndarray) -> Report:
-    at = samples(Engine(model), x_init, bounded)
-    found = compare(model, at, bounded=bounded, derivatives=True)
+def _agreement(
+    model: mujoco.MjModel, x_init: np.ndarray, contacts: Contacts, bounded: np.ndarray
+) -> Report:
+    at = samples(Engine(model, contacts), x_init, bounded)
+    found = compare(model, at, contacts, bounded, derivatives=True)
     return {
         "velocity_error": float(found.velocity.max()),
         "velocity_error_at_x_init": float(found.velocity[0]),

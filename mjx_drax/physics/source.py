@@ -13,6 +13,7 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxError, cut, shown
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.motors import Actuators, add_motors
 from mjx_drax.physics.states import quiet
 
 _FOLDER_OF = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
@@ -38,20 +39,31 @@ _COUNTS = {
 }
 
 
-def load(source: str | Path | mujoco.MjModel) -> mujoco.MjModel:
+def load(source: str | Path | mujoco.MjModel, actuators: Actuators | None = None) -> mujoco.MjModel:
     """A model from a file, an XML string or a `mujoco.MjModel`.
+
+    Args:
+        source: the model.
+        actuators: that it gets if it has none, see `motors.add_motors`.
 
     Raises:
         DraxError: the file is missing, MuJoCo cannot compile it, or it holds NaN.
     """
-    model = source if isinstance(source, mujoco.MjModel) else _compiled(source)
+    compiled = isinstance(source, mujoco.MjModel)
+    if actuators is not None and (compiled or is_binary(source)):
+        raise DraxError(
+            "actuators cannot be added to a model that is compiled: give its MJCF file or XML."
+        )
+    model = source if compiled else _compiled(source, actuators)
     _require_finite(model)
     return model
 
 
-def _compiled(source: str | Path) -> mujoco.MjModel:
+def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel:
     try:
         with quiet():
+            if actuators is not None and (is_xml(source) or Path(source).is_file()):
+                return _spec(source, actuators).compile()
             if is_xml(source):
                 return mujoco.MjModel.from_xml_string(source)
             if not Path(source).is_file():
@@ -74,6 +86,15 @@ def _compiled(source: str | Path) -> mujoco.MjModel:
         raise DraxError(
             f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} {fix}"
         ) from error
+
+
+def _spec(source: str | Path, actuators: Actuators | None) -> mujoco.MjSpec:
+    """What MuJoCo compiles, of a file or an XML string."""
+    xml = is_xml(source)
+    spec = mujoco.MjSpec.from_string(source) if xml else mujoco.MjSpec.from_file(str(source))
+    if actuators is not None:
+        add_motors(spec, actuators, spec.modelname)
+    return spec
 
 
 def _require_finite(model: mujoco.MjModel) -> None:
@@ -125,10 +146,17 @@ def is_binary(given: object) -> bool:
     return not is_xml(given) and Path(str(given)).suffix.lower() == ".mjb"
 
 
-def origin_of(given: str | Path | mujoco.MjModel) -> str | Path | None:
-    """The MJCF that a model is given as: its XML, or its file's absolute path; or None."""
+def origin_of(
+    given: str | Path | mujoco.MjModel, model: mujoco.MjModel, actuators: Actuators | None = None
+) -> str | Path | Source | None:
+    """The MJCF that a model is given as: its XML, or its file's absolute path; or None.
+
+    Where it gets actuators: its MJCF with them.
+    """
     if isinstance(given, mujoco.MjModel) or is_binary(given):
         return None
+    if actuators is not None:
+        return Source.of(given, model, actuators)
     return given if is_xml(given) else Path(given).resolve()
 
 
@@ -156,8 +184,10 @@ class Source:
     assets: dict[str, bytes] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, given: str | Path, model: mujoco.MjModel) -> Source:
-        """Of a file or an XML string, from which the model was compiled.
+    def of(
+        cls, given: str | Path, model: mujoco.MjModel, actuators: Actuators | None = None
+    ) -> Source:
+        """Of a file or an XML string, from which the model was compiled, with these actuators.
 
         Files that they include become part of the text; others that they name are read, and lose
         their folders.
@@ -166,10 +196,8 @@ class Source:
             DraxError: one of the files is missing or has changed, or MuJoCo cannot read it.
         """
         try:
-            if is_xml(given):
-                spec, folder = mujoco.MjSpec.from_string(given), Path()
-            else:
-                spec, folder = mujoco.MjSpec.from_file(str(given)), Path(given).parent
+            spec = _spec(given, actuators)
+            folder = Path() if is_xml(given) else Path(given).parent
             if binary(spec.compile()) != binary(model):
                 raise DraxError("it has changed since the model was loaded.")
             root = ElementTree.fromstring(spec.to_xml())

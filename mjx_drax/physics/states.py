@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.pairs import Contacts, Pair, left_out
 
 Floats = npt.NDArray[np.floating]
 
@@ -80,22 +81,39 @@ def interpolated(model: mujoco.MjModel, qpos: Floats, times: Floats, time: float
     return moved(model, qpos[last], between(model, qpos[last], qpos[last + 1]), share)
 
 
+@contextlib.contextmanager
+def without(pairs: Collection[Pair]) -> Iterator[None]:
+    """Keep the C engine from making contacts between pairs of geoms; of a <pair> it makes them."""
+    if pairs:
+        both = {*pairs, *((b, a) for a, b in pairs)}
+        mujoco.set_mjcb_contactfilter(lambda model, data, a, b: (a, b) in both)
+    try:
+        yield
+    finally:
+        if pairs:
+            mujoco.set_mjcb_contactfilter(None)
+
+
 class Engine:
     """Single steps of the C engine, with constraints solved to rounding."""
 
-    def __init__(self, model: mujoco.MjModel, contacts: bool | int = True) -> None:
+    def __init__(self, model: mujoco.MjModel, contacts: Contacts = True) -> None:
         self.model = copy.deepcopy(model)
         self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
         self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         if not contacts:
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._without = left_out(self.model, contacts)
+        pairs = zip(model.pair_geom1, model.pair_geom2, strict=True)
+        unwanted = [(a, b) in self._without or (b, a) in self._without for a, b in pairs]
+        self.model.pair_margin[unwanted] = -mujoco.mjMAXVAL
 
     def step(self, x: Floats, u: Floats, steps: int = 1) -> Floats:
         """The state (nx,) some steps after x (nx,) under u (nu,)."""
         data = mujoco.MjData(self.model)
         set_state(self.model, data, x)
         data.ctrl[:] = u
-        with quiet():
+        with quiet(), without(self._without):
             mujoco.mj_step(self.model, data, steps)
         return np.concatenate([data.qpos, data.qvel, data.act])
 

@@ -28,7 +28,7 @@ from jax import Array
 
 from mjx_drax.kernels.linalg import cholesky, solve, symmetric
 from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
-from mjx_drax.physics.collision import collision
+from mjx_drax.physics.collision import collision, make_data
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import BALL, FREE, Joints
 from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
@@ -54,7 +54,7 @@ def state(data: mjx.Data) -> Array:
 def data_at(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
     """`mjx.Data` holding a state (nx,) and a control (nu,)."""
     qpos, qvel, act = jnp.split(x, [model.nq, model.nq + model.nv])
-    return mjx.make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
+    return make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
 
 
 def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:

@@ -1,16 +1,19 @@
-"""Models that others wrote, as they are installed: dm_control's suite and gymnasium's.
+"""Models that others wrote, as they are installed, or as they lie in a folder.
 
-    python -m mjx_drax.studies.third_party [NAME ...] [--chains N] [--seed S] [--timeout S]
-                                           [--out DIR]
+    python -m mjx_drax.studies.third_party [NAME ...] [--path DIR] [--chains N] [--seed S]
+                                           [--timeout S] [--out DIR]
 
 Each is either solved (`postures.reach`, default settings) or refused with a reason; a Markdown
-table says which. Models come from `pip install "mjx-drax[third-party]"`; only their files are read,
-and nothing of the packages is imported. Every model gets a process of its own, with a time limit.
+table says which, and another one counts the reasons. Models without actuators get motors. Models
+come from `pip install "mjx-drax[third-party]"`, from other packages of `FOLDERS`, or from any
+folder, such as a checkout of MuJoCo Menagerie; only their files are read, and nothing of the
+packages is imported. Every model gets a process of its own, with a time limit.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import json
 import subprocess
@@ -25,7 +28,27 @@ from mjx_drax.base.files import write_json
 Row = dict[str, Any]
 
 FOLDERS = {"dm_control": "suite", "gymnasium": "envs/mujoco/assets"}
-"""Where the packages keep their models."""
+"""Where the packages keep their models, one beside the other."""
+
+TREES = {
+    "gymnasium_robotics": "envs/assets",
+    "metaworld": "assets",
+    "mjlab": "asset_zoo",
+    "mujoco_playground": "_src",
+    "robosuite": "models/assets",
+}
+"""Where packages keep models in folders of folders, together with parts of models."""
+
+CAUSES = {
+    "cannot collide geoms": "pairs of geoms that MJX cannot collide",
+    "differs from MuJoCo's C engine": "one step differs too much",
+    "MJX does not support": "elements that MJX does not support",
+    "ranges of its joints": "it leaves the ranges of its joints",
+    "has no joints": "no joints",
+    "no hinge or slide": "no hinge or slide that a motor could drive",
+    "not done after": "out of time",
+}
+"""Words of refusals, and what they are counted as."""
 
 HEADER = (
     "| model | nq/nv/nu | constraint rows | K | refused because, or failed | compile [s] "
@@ -33,14 +56,31 @@ HEADER = (
 )
 
 
-def models() -> dict[str, Path]:
-    """Files of the models that are installed, by names like `gymnasium/hopper`."""
+def models(folder: Path | None = None) -> dict[str, Path]:
+    """Files of the models that are installed, by names like `gymnasium/hopper`; or of a folder."""
     found: dict[str, Path] = {}
-    for package, folder in FOLDERS.items():
+    if folder is not None:
+        return complete_models(folder, folder.resolve().name)
+    for package, inside in {**FOLDERS, **TREES}.items():
         spec = importlib.util.find_spec(package)
         for place in (spec.submodule_search_locations or []) if spec else []:
-            for path in sorted((Path(place) / folder).glob("*.xml")):
+            if package in TREES:
+                found |= complete_models(Path(place) / inside, package)
+                continue
+            for path in sorted((Path(place) / inside).glob("*.xml")):
                 found[f"{package}/{path.stem}"] = path
+    return found
+
+
+def complete_models(folder: Path, name: str) -> dict[str, Path]:
+    """Files under a folder that MuJoCo compiles and in which something can move."""
+    from mjx_drax.physics.source import load
+
+    found = {}
+    for path in sorted([*folder.rglob("*.xml"), *folder.rglob("*.urdf")]):
+        with contextlib.suppress(DraxError):
+            if load(path).nv:
+                found[f"{name}/{path.relative_to(folder).with_suffix('')}"] = path
     return found
 
 
@@ -64,6 +104,8 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
     row: Row = {"model": name}
     try:
         host = load(path)
+        if host.nv and not host.nu:
+            host = load(path, "torque")
         row |= {"nq": host.nq, "nv": host.nv, "nu": host.nu}
         problem = reach(host, seed, name=name)
         assert isinstance(problem.dynamics, MjxDynamics)
@@ -85,9 +127,11 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
     }
 
 
-def measure_apart(name: str, chains: int = 16, seed: int = 0, timeout: float = 600.0) -> Row:
+def measure_apart(
+    name: str, path: Path, chains: int = 16, seed: int = 0, timeout: float = 600.0
+) -> Row:
     """`measure` in a process of its own, which is ended after `timeout` [s]."""
-    command = [sys.executable, "-m", "mjx_drax.studies.third_party", name, "--here"]
+    command = [sys.executable, "-m", "mjx_drax.studies.third_party", name, "--here", str(path)]
     command += ["--chains", str(chains), "--seed", str(seed)]
     try:
         result = subprocess.run(command, stdout=subprocess.PIPE, timeout=timeout, check=False)
@@ -119,6 +163,19 @@ def line(row: Row) -> str:
     )
 
 
+def causes(rows: Sequence[Row]) -> str:
+    """A table of how many models were refused or failed for which cause, in Markdown."""
+    counts: dict[str, list[str]] = {}
+    for row in rows:
+        words = row.get("refused") or row.get("failed")
+        if words:
+            known = (cause for part, cause in CAUSES.items() if part in words)
+            counts.setdefault(next(known, "other"), []).append(row["model"])
+    order = sorted(counts.items(), key=lambda entry: -len(entry[1]))
+    lines = [f"| {cause} | {len(names)} | {names[0]} |" for cause, names in order]
+    return "\n".join(["| cause | models | such as |\n|---|---|---|", *lines])
+
+
 def fine(row: Row) -> bool:
     """Whether the model was solved, or refused with a reason."""
     return bool(row.get("certified") or row.get("refused"))
@@ -130,32 +187,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="python -m mjx_drax.studies.third_party", description=__doc__
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="default: all that are installed")
+    parser.add_argument("--path", type=Path, metavar="DIR", help="models of a folder instead")
     parser.add_argument("--chains", type=int, default=16)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--timeout", type=float, default=600.0, metavar="SECONDS")
     parser.add_argument("--out", metavar="DIR", help="where third_party.json goes")
-    parser.add_argument("--here", action="store_true", help="in this process; prints JSON")
+    parser.add_argument("--here", type=Path, metavar="FILE", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
-    known = models()
+    if options.here:
+        row = measure(options.names[0], options.here, options.chains, options.seed)
+        print(json.dumps(row), flush=True)
+        return 0
+    known = models(options.path)
     unknown = [name for name in options.names if name not in known]
     if unknown or not known:
         names = ", ".join(known) or 'none: pip install "mjx-drax[third-party]"'
         print(f"there is no model {', '.join(unknown)}: there is {names}.", file=sys.stderr)
         return 2
     rows = []
-    if not options.here:
-        print(HEADER, flush=True)
+    print(HEADER, flush=True)
     for name in options.names or known:
-        if options.here:
-            row = measure(name, known[name], options.chains, options.seed)
-            print(json.dumps(row), flush=True)
-        else:
-            row = measure_apart(name, options.chains, options.seed, options.timeout)
-            print(line(row), flush=True)
+        row = measure_apart(name, known[name], options.chains, options.seed, options.timeout)
+        print(line(row), flush=True)
         rows.append(row)
         if options.out:  # after every row, because a run takes long
             write_json(Path(options.out) / "third_party.json", rows)
-    return 0 if options.here or all(map(fine, rows)) else 1
+    print(f"\n{causes(rows)}", flush=True)
+    return 0 if all(map(fine, rows)) else 1
 
 
 if __name__ == "__main__":

@@ -387,4 +387,8 @@ def test_check_says_what_stands_in_the_way(own, capsys):
     model.write_text(SLIDER.split("<actuator>")[0] + "</mujoco>")
     assert main(["check", str(model)]) == 1
     assert "CANNOT BE USED: slider has no actuators" in capsys.readouterr().out
+    assert main(["check", str(model), "--actuators", "torque=1", "--contacts", "foot:cart"]) == 1
+    out = capsys.readouterr().out
+    assert "actuator     slide: motor on joint slide, control -1 to 1" in out
+    assert "CANNOT BE USED: contacts names 'foot'" in out
     assert "no.xml" in error_of(capsys, "check", "no.xml")

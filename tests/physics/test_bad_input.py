@@ -11,10 +11,11 @@ from mjx_drax.physics.report import check
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")
 
-CUPS = (
-    '<body pos="0 0 1"><geom name="cup" type="ellipsoid" size="1 1 1"/></body>'
-    '<geom name="can" type="box" size="1 1 1"/>'
+GROUNDS = (
+    '<body pos="0 0 1"><joint/><geom mass="1" type="hfield" hfield="h"/></body>'
+    '<geom type="hfield" hfield="h"/>'
 )
+FIELD = '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>'
 ROPE = (
     '<flexcomp name="rope" type="grid" count="3 1 1" dim="1" spacing=".1 .1 .1" mass="1"/>'
     "</worldbody>"
@@ -74,7 +75,8 @@ MODELS = [
      "key_qpos", "nan"),
     ("keyframe-infinite", lambda at: robot(arm().replace('qpos="0.1"', 'qpos="inf"')),
      "keyframe", "inf"),
-    ("cylinder-collides", lambda at: robot(arm(CUPS)), "MJX cannot collide", "contacts=False"),
+    ("fields-collide", lambda at: robot(arm(GROUNDS).replace("<worldbody>", FIELD)),
+     "MJX cannot collide", "contacts=False"),
     ("flex", lambda at: robot(arm().replace('qpos="0.1"', "").replace("</worldbody>", ROPE)),
      "flex", "remove"),
     ("body-transmission", lambda at: robot(arm(actuator='<adhesion body="link" ctrlrange="0 1"/>')),

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 
-from mjx_drax.physics._mjx import COLLISIONS, mjx
-from mjx_drax.physics.collision import CORNERS, collision, plane_box
+from mjx_drax.physics._mjx import COLLISIONS
+from mjx_drax.physics.collision import CORNERS, collision, hulls, make_data, plane_box
 from mjx_drax.physics.mjx_model import put_model
 
 BOX = """
@@ -18,22 +19,27 @@ BOX = """
 </mujoco>"""
 
 
+def contacts_of(model):
+    """A function that gives the contacts of MJX where the geoms of `mujoco.MjData` are."""
+    on_device = put_model(model)
+    data = make_data(on_device)
+    find = jax.jit(
+        lambda pos, mat: (
+            collision(on_device, data.replace(geom_xpos=pos, geom_xmat=mat))._impl.contact
+        )
+    )
+    return lambda at: find(jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3))
+
+
 def test_a_box_stands_on_the_corners_that_the_c_engine_has():
     model = mujoco.MjModel.from_xml_string(BOX)
     wanted, rng, counts = mujoco.MjData(model), np.random.default_rng(0), set()
     with jax.enable_x64(True):
-        on_device = put_model(model)
-        data = mjx.make_data(on_device)
-        find = jax.jit(
-            lambda pos, mat: (
-                collision(on_device, data.replace(geom_xpos=pos, geom_xmat=mat))._impl.contact
-            )
-        )
+        find = contacts_of(model)
         for _ in range(40):
             wanted.qpos[:] = [0, 0, 0.29, 1, *rng.normal(size=3) * 0.04]
             mujoco.mj_forward(model, wanted)
-            mat = jnp.asarray(wanted.geom_xmat).reshape(-1, 3, 3)
-            found = find(jnp.asarray(wanted.geom_xpos), mat)
+            found = find(wanted)
             acting = np.asarray(found.dist) < model.geom_margin.sum()
             one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.contact.pos))
             for name in ("dist", "pos", "frame"):
@@ -48,3 +54,97 @@ def test_mjx_keeps_its_own_way():
     boxes = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
     assert COLLISIONS[boxes] is not plane_box
     assert len(np.unique(CORNERS, axis=0)) == COLLISIONS[boxes].ncon * 2 == plane_box.ncon * 2
+
+
+PRISM = "-.1 -.1 -.1 .1 -.1 -.1 0 .12 -.1 -.1 -.1 .1 .1 -.1 .1 0 .12 .1"
+MEETING = """
+<mujoco>
+  <asset><mesh name="m" vertex="{mesh}"/></asset>
+  <worldbody>
+    <geom {other} margin="{margin}"/>
+    <body><freejoint/><geom type="{kind}" size="0.06 0.1 0.04"/></body>
+  </worldbody>
+</mujoco>"""
+BOXES, MESHES = 'type="box" size=".1 .12 .08"', 'type="mesh" mesh="m"'
+
+
+def meeting(kind, other, margin=0.0):
+    xml = MEETING.format(kind=kind, other=other, margin=margin, mesh=PRISM)
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def approached(model, count, depth, seed=0):
+    """Data of the C engine with geoms in random poses that overlap by up to `depth` [m]."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    for _ in range(count):
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        data.qpos[3:] = rng.normal(size=4)
+        near, far = 0.0, 0.5
+        for _ in range(30):
+            middle = (near + far) / 2
+            data.qpos[:3] = middle * direction
+            mujoco.mj_kinematics(model, data)
+            apart = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None) > 0
+            near, far = (near, middle) if apart else (middle, far)
+        data.qpos[:3] = (near - rng.uniform(0, depth)) * direction
+        mujoco.mj_forward(model, data)
+        yield data
+
+
+@pytest.mark.parametrize(
+    ("kind", "other", "usual", "worst"),
+    [
+        ("cylinder", MESHES, 1e-4, 3e-3),
+        ("ellipsoid", BOXES, 2e-5, 1e-4),
+    ],
+)
+def test_cylinders_and_ellipsoids_meet_boxes_and_meshes_as_in_the_c_engine(
+    kind, other, usual, worst
+):
+    model = meeting(kind, other)
+    contacts_of(model)(mujoco.MjData(model))  # constants of float32 are not those of float64
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        depths, normals = [], []
+        for wanted in approached(model, 100, 0.004):
+            found = find(wanted)
+            here, there = int(found.dist.argmin()), int(wanted.contact.dist.argmin())
+            depths.append(abs(float(found.dist[here]) - wanted.contact.dist[there]))
+            # MuJoCo's normals point from the first geom to the second one
+            sign = 1 if wanted.contact.geom[there, 0] == found.geom[here, 0] else -1
+            normals.append(sign * found.frame[here, 0] @ wanted.contact.frame[there, :3])
+            wanted.qpos[:3] *= 1.2
+            mujoco.mj_forward(model, wanted)
+            apart = find(wanted).dist.min()
+            assert wanted.ncon or float(apart) > 0
+    assert np.quantile(depths, 0.85) < usual
+    assert np.max(depths) < worst
+    assert np.quantile(normals, 0.2) > 0.99
+
+
+def test_two_boxes_touch_at_every_point_once():
+    model = meeting("box", BOXES)
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for wanted in approached(model, 30, 0.004):
+            found = find(wanted)
+            acting = np.asarray(found.pos)[np.asarray(found.dist) < 0].round(5)
+            assert len(np.unique(acting, axis=0)) == len(acting)
+
+
+def test_hulls_of_meshes_have_no_corner_outside_of_a_face():
+    rng = np.random.default_rng(0)
+    angle = np.linspace(0, 2 * np.pi, 45)[:-1]
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    cone = np.concatenate([ring, ring * 0.7 + np.array([0, 0, 0.5])])
+    for points in (rng.normal(size=(60, 3)), cone):
+        vertex = " ".join(f"{x:.9f}" for x in (0.1 * points).ravel())
+        model = mujoco.MjModel.from_xml_string(
+            MEETING.replace("{mesh}", vertex).format(kind="sphere", other=MESHES, margin=0.0)
+        )
+        hull = hulls(model, [0])[0]
+        inside = (hull.face_normal * hull.face[:, 0]).sum(axis=1)
+        assert (hull.vert @ hull.face_normal.T - inside).max() < 1e-6
+        corners, edges = len(hull.vert), len(hull.edge)
+        assert edges == hull.edge_face_normal.shape[0] == corners + len(hull.face) - 2

@@ -15,13 +15,13 @@ from mjx_drax.physics.checks import Samples, compare
 from mjx_drax.physics.mjx_model import (
     MOST_CONTACTS,
     constraint_rows,
-    contact_pairs,
     contact_points,
     differences,
     has_constraints,
     kept_contacts,
     put_model,
 )
+from mjx_drax.physics.pairs import contact_pairs
 from mjx_drax.physics.states import Engine
 from mjx_drax.physics.step import step
 
@@ -126,12 +126,9 @@ def test_tendon_springs_have_stiffness_at_rest():
 
 MUSCLE = 'dyntype="user" joint="one"'
 TETRAHEDRON = "0 0 0 0.2 0 0 0 0.2 0 0 0 0.2"
-MESHES = "".join(
-    f'<body pos="{x} 3 3"><joint axis="0 1 0"/><geom name="{name}" type="mesh" mesh="m" '
-    'margin="0.01" contype="2" conaffinity="1"/></body>'
-    for x, name in ((3, "tip"), (6, "top"))
-)
-CYLINDER = '<body pos="9 0 0"><joint/><geom type="cylinder" size="1 1" contype="4"/></body>'
+GROUND = '<asset><hfield name="ground" nrow="2" ncol="2" size="1 1 0.1 0.1"/></asset>'
+FIELDS = {"before": GROUND, "floor": "hfield", "floors": 'hfield="ground"'}
+MOVES = '<worldbody><body pos="0 0 9"><joint/><geom mass="1" type="hfield" hfield="ground"/></body>'
 APART = {"links": 'contype="0" conaffinity="0"'}
 
 
@@ -139,27 +136,14 @@ APART = {"links": 'contype="0" conaffinity="0"'}
     ("parts", "words"),
     [
         (
-            {"floor": "box", "floors": 'pos="0 0 -1"', "link": "ellipsoid"},
-            r"cannot collide geoms 'link' and 'floor' \(ellipsoid with box\): make each ellipsoid "
-            r"among them a .*contacts=False",
-        ),
-        (
-            {
-                "before": f'<asset><mesh name="m" vertex="{TETRAHEDRON}"/></asset>',
-                "link": "ellipsoid",
-                "floor": "box",
-                "floors": 'pos="0 0 -1"',
-                "more": f"<worldbody>{MESHES}{CYLINDER}</worldbody>",
-            },
-            r"'link' and 'floor' \(ellipsoid with box\), 'geom 5 of body 5' and 'floor' \(cylinder "
-            r"with box\),.* each cylinder and ellipsoid .*no margins.* 'floor' and 'tip' \(box "
-            r'with mesh, one of 2 such pairs\).* set margin="0"',
+            FIELDS | {"more": f"{MOVES}</worldbody>"},
+            r"cannot collide geoms 'floor' and 'geom 3 of body 3' \(hfield with hfield\): make "
+            r"them .*contacts=\[...\].*contacts=False",
         ),
         (
             {"option": 'integrator="implicit" density="1"', **APART},
             'set <option integrator="Euler"',
         ),
-        ({"option": 'cone="elliptic"', "links": 'condim="1"', "floors": 'condim="1"'}, "pyramidal"),
         (
             {"actuator": '<adhesion body="upper" ctrlrange="0 1"/>'},
             "does not support.*drive joints, tendons or sites",
@@ -174,7 +158,7 @@ APART = {"links": 'contype="0" conaffinity="0"'}
             "flex",
         ),
     ],
-    ids=["collision", "collisions", "fluid", "condim", "transmission", "dynamics", "flag", "flex"],
+    ids=["collision", "fluid", "transmission", "dynamics", "flag", "flex"],
 )
 def test_what_is_refused_says_why_and_what_to_do(parts, words):
     with pytest.raises(DraxError, match=words):
@@ -182,10 +166,30 @@ def test_what_is_refused_says_why_and_what_to_do(parts, words):
 
 
 def test_contacts_that_mjx_cannot_make_can_be_left_out():
-    model = chain(floor="box", floors='pos="0 0 -1"', link="ellipsoid")
+    model = chain(**FIELDS, more=f"{MOVES}</worldbody>")
     assert not has_constraints(put_model(model, contacts=False))
+    assert has_constraints(put_model(model, [("floor", "ball")]))
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     assert not has_constraints(put_model(model))
+
+
+def test_frictionless_contacts_have_elliptic_cones_too():
+    model = chain(option='cone="elliptic"', floors='condim="1" pos="0 0 0.13"')
+    model.geom_condim[model.geom("ball").id] = 1
+    at = Samples(np.array([[0.0, 0.0, 0.5, 1.0]]), np.zeros((1, 2)))
+    assert Engine(model).active_contacts(at.x[0]) > 0
+    assert compare(model, at).velocity[0] < 1e-5
+
+
+def test_meshes_on_planes_have_margins():
+    cube = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><mesh name="m" vertex="{cube}"/></asset><worldbody>
+        <geom type="plane" size="1 1 1" margin="0.02"/><body><joint type="slide" axis="0 0 1"/>
+        <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+    )
+    at = Samples(np.array([[0.11, -0.5], [0.09, 0.0], [0.13, 0.0]]), np.zeros((3, 0)))
+    assert compare(model, at).velocity.max() < 1e-9
 
 
 def test_a_plan_keeps_the_nearest_contacts_of_a_model_that_has_many():

@@ -9,7 +9,7 @@ import pytest
 from mjx_drax import DraxError
 from mjx_drax.modelling.postures import TOLERANCE, reach
 from mjx_drax.models import path
-from mjx_drax.studies.third_party import FOLDERS, fine, line, main, measure_apart, models
+from mjx_drax.studies.third_party import FOLDERS, TREES, fine, line, main, measure_apart, models
 
 SMALL = [
     "dm_control/ball_in_cup",
@@ -36,7 +36,7 @@ SMALL = [
 def test_is_solved_or_refused(name):
     if name not in models():
         pytest.skip(f"{name.split('/')[0]} is not installed: pip install 'mjx-drax[third-party]'")
-    row = measure_apart(name, chains=8, timeout=1000)
+    row = measure_apart(name, models()[name], chains=8, timeout=1000)
     assert fine(row), row
 
 
@@ -87,17 +87,29 @@ def test_rows_of_the_table():
 
 
 def test_models_are_chosen_by_name(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(
-        "mjx_drax.studies.third_party.models", lambda: {"own/rock": tmp_path / "rock.xml"}
-    )
+    rock = tmp_path / "rock.xml"
+    monkeypatch.setattr("mjx_drax.studies.third_party.models", lambda folder: {"own/rock": rock})
     assert main(["own/stone"]) == 2
     assert "there is no model own/stone: there is own/rock" in capsys.readouterr().err
-    (tmp_path / "rock.xml").write_text("<mujoco model='rock'><worldbody/></mujoco>")
-    assert main(["own/rock", "--here", "--out", str(tmp_path)]) == 0
+    rock.write_text("<mujoco model='rock'><worldbody/></mujoco>")
+    assert main(["own/rock", "--here", str(rock)]) == 0
     row = json.loads(capsys.readouterr().out)
     assert "has no joints" in row["refused"]
+    monkeypatch.setattr("mjx_drax.studies.third_party.measure_apart", lambda *_: row)
+    assert main(["own/rock", "--out", str(tmp_path)]) == 0
+    assert "| no joints | 1 | own/rock |" in capsys.readouterr().out
     assert json.loads((tmp_path / "third_party.json").read_text()) == [row]
 
 
+def test_complete_models_of_a_folder_are_found(tmp_path):
+    (tmp_path / "arm").mkdir()
+    body = "<body><joint/><geom size='1'/></body>"
+    (tmp_path / "arm" / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (tmp_path / "part.xml").write_text("<mujocoinclude/>")
+    (tmp_path / "still.xml").write_text("<mujoco><worldbody/></mujoco>")
+    found = models(tmp_path)
+    assert found == {f"{tmp_path.name}/arm/arm": tmp_path / "arm" / "arm.xml"}
+
+
 def test_only_files_of_the_packages_are_read():
-    assert all(name.split("/")[0] in FOLDERS for name in models())
+    assert all(name.split("/")[0] in {**FOLDERS, **TREES} for name in models())

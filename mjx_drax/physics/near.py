@@ -1,0 +1,94 @@
+"""Which contacts a plan has by default, where a model has more than can be computed."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.physics.checks import samples
+from mjx_drax.physics.collision import BOX, MESH
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.pairs import Contacts, Pair, contact_pairs, geom_name
+from mjx_drax.physics.states import Engine, quiet, set_state
+
+MOST_WORK = 2_000_000
+"""Pairs of corners of hulls that a step may compare: MJX compares every edge with every other."""
+
+EACH = 20_000
+"""What every pair counts besides, because each function of MJX takes time to compile."""
+
+NEAR, MOTIONS = 0.1, 4
+"""Distances up to which they are exact [m], and random motions from x_init of 0.6 s that are looked
+at."""
+
+
+def affordable(
+    model: mujoco.MjModel, name: str, x_init: np.ndarray, bounded: np.ndarray, contacts: Contacts
+) -> Contacts:
+    """`contacts`; or, for True and a model that has too many, pairs that come close near x_init.
+
+    Pairs are kept from the nearest on, where `MOST_WORK` allows.
+
+    Warns:
+        DraxWarning: what is left out.
+    """
+    if contacts is not True:
+        return contacts
+    every = list(contact_pairs(model))
+    work = [_work(model, *pair) for pair in every]
+    if sum(work) <= MOST_WORK:
+        return True
+    distance = _least_distances(model, every, x_init, bounded)
+    kept: list[Pair] = []
+    spent = 0.0
+    for i in np.argsort(distance, kind="stable"):
+        if spent + work[i] + EACH <= MOST_WORK:
+            spent += work[i] + EACH
+            kept.append(every[i])
+    first = next(pair for pair in every if pair not in kept)
+    names = " with ".join(repr(geom_name(model, g)) for g in first)
+    warnings.warn(
+        f"{name} has {len(every)} pairs of geoms that may touch, and too many corners of meshes: "
+        f"the plan has contacts of {len(kept)} that come closest in motions from x_init, and of no "
+        f'other, such as {names}. Choose them by contacts=[("foot_*", "floor"), ...].',
+        DraxWarning,
+        stacklevel=3,
+    )
+    return sorted(kept)
+
+
+def _work(model: mujoco.MjModel, a: int, b: int) -> int:
+    """Pairs of corners of two geoms."""
+    return _corners(model, a) * _corners(model, b)
+
+
+def _corners(model: mujoco.MjModel, g: int) -> int:
+    kind, mesh = int(model.geom_type[g]), int(model.geom_dataid[g])
+    if kind != MESH:
+        return 8 if kind == BOX else 1
+    return int(model.mesh_graph[model.mesh_graphadr[mesh]])
+
+
+def _least_distances(
+    model: mujoco.MjModel, pairs: list[Pair], x_init: np.ndarray, bounded: np.ndarray
+) -> np.ndarray:
+    """Least distances [m] of pairs of geoms over states about x_init, or lower bounds of them."""
+    engine, data = Engine(model), mujoco.MjData(model)
+    least = np.full(len(pairs), np.inf)
+    states = [samples(engine, x_init, bounded, seed).x for seed in range(MOTIONS)]
+    a, b = np.array(pairs).T
+    radius = model.geom_rbound[a] + model.geom_rbound[b]
+    radius[(model.geom_rbound[a] == 0) | (model.geom_rbound[b] == 0)] = np.inf  # planes
+    for x in np.concatenate(states):
+        set_state(model, data, x)
+        with quiet():
+            mujoco.mj_kinematics(model, data)
+        apart = np.linalg.norm(data.geom_xpos[a] - data.geom_xpos[b], axis=1) - radius
+        least = np.minimum(least, np.maximum(apart, NEAR))
+        for i in np.flatnonzero(apart < NEAR):
+            with quiet():
+                found = mujoco.mj_geomDistance(model, data, *pairs[i], NEAR, None)
+            least[i] = min(least[i], found)
+    return least

@@ -1,0 +1,94 @@
+"""Actuators for models that have none."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError
+from mjx_drax.physics.source import load, origin_of
+
+XML = """
+<mujoco model="leg">
+  <compiler angle="radian"/>
+  <default><general gear="9" ctrlrange="-9 9"/></default>
+  <worldbody>
+    <body><freejoint/><geom size="0.1"/>
+      <body><joint name="hip" axis="0 1 0" range="-1 1" limited="true" {hip}/>
+        <geom size="0.1" pos="0 0 -0.3"/>
+        <body pos="0 0 -0.6"><joint name="knee" axis="0 1 0"/><geom size="0.1" pos="0 0 -0.3"/>
+          <body><joint type="slide"/><geom size="0.02"/></body>
+        </body></body></body>
+  </worldbody>
+  <keyframe><key qpos="0 0 1 1 0 0 0 0.5 -1 0"/></keyframe>
+  {more}
+</mujoco>"""
+LEG = XML.format(hip='actuatorfrcrange="-30 20"', more="")
+
+
+def limits(model):
+    ranges = zip(model.actuator_ctrllimited, model.actuator_ctrlrange.tolist(), strict=True)
+    return [range_ if limited else None for limited, range_ in ranges]
+
+
+def test_motors_have_the_limits_of_the_joints():
+    model = load(LEG, "torque")
+    assert [model.actuator(a).name for a in range(model.nu)] == ["hip", "knee", "joint_3"]
+    assert limits(model) == [[-30, 20], None, None]
+    assert limits(load(LEG, {"torque": 5})) == [[-30, 20], [-5, 5], [-5, 5]]
+    some = load(LEG, {"torque": {"knee": 5.0, "h*": 7.0}})
+    assert limits(some) == [[-30, 20], [-5, 5]]
+    data = mujoco.MjData(some)
+    data.ctrl[:] = 1.0, 2.0
+    mujoco.mj_forward(some, data)
+    np.testing.assert_allclose(data.qfrc_actuator[6:8], [1.0, 2.0])
+
+
+def test_servos_are_critically_damped_and_move_within_the_range():
+    model = load(LEG, {"position": 40})
+    assert limits(model) == [[-1, 1], None, None]
+    servo = '<actuator><position joint="hip" kp="40" dampratio="1" gear="1" ctrlrange="-1 1"/>'
+    written = load(XML.format(hip='actuatorfrcrange="-30 20"', more=f"{servo}</actuator>"))
+    for name in ("gainprm", "biasprm", "ctrlrange", "gear", "biastype"):
+        own, wanted = (getattr(m, f"actuator_{name}")[0] for m in (model, written))
+        np.testing.assert_array_equal(own, wanted, name)
+    assert model.actuator_biasprm[0, 2] < 0
+
+
+@pytest.mark.parametrize(
+    ("actuators", "words"),
+    [
+        ("position", "actuators is 'position': give \"torque\""),
+        ({"torque": -1}, "positive numbers"),
+        ({"velocity": 1}, 'give "torque"'),
+        ({"torque": {"knie": 3}}, "fits 'knie': its joints are 'hip', 'knee'"),
+    ],
+)
+def test_other_forms_are_refused(actuators, words):
+    with pytest.raises(DraxError, match=words):
+        load(LEG, actuators)
+
+
+def test_a_model_with_actuators_keeps_them():
+    more = '<actuator><motor joint="hip"/></actuator>'
+    with pytest.raises(DraxError, match="leg has 1 of its own: leave it out"):
+        load(XML.format(hip="", more=more), "torque")
+    with pytest.raises(DraxError, match="compiled: give its MJCF file or XML"):
+        load(load(LEG), "torque")
+
+
+def test_a_model_is_written_with_its_motors(tmp_path):
+    path = tmp_path / "leg.xml"
+    path.write_text(LEG)
+    model = load(path, "torque")
+    again = origin_of(path, model, "torque").compiled()
+    assert (model.nu, again.nu) == (3, 3)
+    np.testing.assert_array_equal(again.actuator_ctrlrange, model.actuator_ctrlrange)
+
+
+def test_a_urdf_gives_its_efforts():
+    link = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" '
+    link += 'ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    joint = '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
+    joint += '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5" velocity="1"/></joint>'
+    urdf = f'<robot name="r">{link.format("a")}{link.format("b")}{joint}</robot>'
+    assert limits(load(urdf, "torque")) == [[-5, 5]]

@@ -1,0 +1,105 @@
+"""Contacts that are chosen by names, and those that a plan has by default."""
+
+import json
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_drax import DraxError
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.physics import near
+from mjx_drax.physics.checks import Samples, compare
+from mjx_drax.physics.dynamics import MjxDynamics
+from mjx_drax.physics.mjx_model import contact_points, put_model
+from mjx_drax.physics.pairs import contact_pairs, left_out
+from mjx_drax.physics.states import Engine
+
+XML = """
+<mujoco model="walker">
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <geom type="sphere" size="0.1" pos="2 0 0.1"/>
+    <body name="left"><joint name="one" type="slide" axis="0 0 1"/>
+      <geom name="foot_left" size="0.1" pos="0 0 0.1"/></body>
+    <body name="right"><joint type="slide" axis="0 0 1"/>
+      <geom name="foot_right" size="0.1" pos="0.25 0 0.1"/>
+      <geom name="shin" type="box" size="0.1 0.1 0.1" pos="0.25 0 0.4"/></body>
+  </worldbody>
+  <actuator><motor joint="one"/></actuator>
+  {more}
+</mujoco>"""
+
+
+def walker(more=""):
+    return mujoco.MjModel.from_xml_string(XML.format(more=more))
+
+
+def kept(model, contacts):
+    pairs = set(contact_pairs(model)) - left_out(model, contacts)
+    return {" ".join(sorted(model.geom(g).name or "-" for g in pair)) for pair in pairs}
+
+
+def test_pairs_are_chosen_by_names_of_geoms_and_bodies():
+    model = walker()
+    assert kept(model, [("foot_*", "floor")]) == {"floor foot_left", "floor foot_right"}
+    assert kept(model, [("left", "shin"), ("world", "left")]) == {
+        "foot_left shin",
+        "floor foot_left",
+        "- foot_left",
+    }
+    assert len(kept(model, True)) == 8
+    assert kept(model, False) == set()
+
+
+@pytest.mark.parametrize(
+    ("contacts", "words"),
+    [
+        ([("foot_lift", "floor")], "names 'foot_lift'.*nearest names are 'foot_left'"),
+        ([("foot_*", "shins")], "names 'shins'.*'shin'"),
+        ([("floor", "floor")], "MuJoCo makes no contact between them"),
+        (("foot_left", "floor"), r"contacts is 'foot_left': .*\[\(\"foot_\*\", \"floor\"\)\]"),
+        ([("foot_left", 99)], "contacts is 99"),
+    ],
+)
+def test_what_cannot_touch_is_refused(contacts, words):
+    with pytest.raises(DraxError, match=words):
+        put_model(walker(), contacts)
+
+
+PAIR = '<contact><pair geom1="foot_right" geom2="floor"/></contact>'
+
+
+def test_a_step_has_the_contacts_that_were_chosen():
+    """Both feet stand; without its contact the right one falls, in both engines."""
+    x, u = np.array([-0.01, -0.01, 0, 0]), np.zeros(1)
+    contacts = [("foot_left", "floor")]
+    for model in (walker(), walker(PAIR)):
+        assert len(contact_points(put_model(model, contacts))) == 1
+        end = Engine(model, contacts).step(x, u)
+        assert end[3] == pytest.approx(-0.0981)
+        assert end[2] > 0
+        assert mujoco.get_mjcb_contactfilter() is None
+    assert compare(model, Samples(x[None], u[None]), contacts).velocity[0] < 1e-9
+
+
+def test_dynamics_know_their_contacts_by_number():
+    model = walker()
+    planned = put_model(model, [("foot_*", "floor")])
+    dynamics = MjxDynamics(planned, 0.01, model, 1)
+    assert dynamics.contacts == dynamics.in_float64().contacts == [(0, 2), (0, 3)]
+    again = put_model(model, json.loads(json.dumps(dynamics.contacts)))
+    assert jax.tree.structure(again) == jax.tree.structure(planned)
+
+
+def test_of_too_many_contacts_the_nearest_are_kept(monkeypatch):
+    model, x, none = walker(), np.zeros(4), np.zeros(2, bool)
+    assert near.affordable(model, "walker", x, none, True) is True
+    monkeypatch.setattr(near, "MOST_WORK", 8)
+    monkeypatch.setattr(near, "EACH", 2)
+    with pytest.warns(DraxWarning, match="8 pairs .* 2 that come closest .* no other, such as"):
+        found = near.affordable(model, "walker", x, none, True)
+    assert found == [(0, 2), (0, 3)]
+    assert near.affordable(model, "walker", x, none, 3) == 3
