@@ -37,6 +37,16 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), target
 
 
+def test_the_code_that_the_paper_page_names_exists():
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    pairs = re.findall(r"`([a-z_/]+\.py)`: (`\w[\w.]*`(?:, `\w[\w.]*`)*)", text)
+    assert len(pairs) > 10
+    for file, names in pairs:
+        source = (ROOT / "mjx_drax" / file).read_text(encoding="utf-8")
+        for name in re.findall(r"(\w+)`", names):
+            assert re.search(rf"(def|class) {name}\b", source), (file, name)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_examples_run(tmp_path, monkeypatch):
