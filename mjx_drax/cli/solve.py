@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __doc__ += cost_file.HELP
 
-LOOK = ("camera", "size", "fps", "speed")
+LOOK = ("camera", "size", "fps", "speed", "caption")
 """What a user may say about videos and films."""
 
 
@@ -62,11 +62,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--camera",
         metavar="NAME",
-        help="a camera of the model, or free: one that shows the whole motion",
+        help="a camera of the model; free: one that shows the whole motion; follow: one that goes "
+        "with the robot",
     )
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]")
-    add("--fps", type=float, metavar="N", help="frames per second")
+    add("--fps", type=float, metavar="N", help="frames per second; default 30")
     add("--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion")
+    add(
+        "--no-caption",
+        dest="caption",
+        action="store_false",
+        default=None,
+        help="no text under videos and films",
+    )
+    add(
+        "--side-by-side",
+        action="store_true",
+        help="also film plan and replay beside each other: comparison.mp4",
+    )
     export.add_flags(parser)
     add(
         "--set",
@@ -152,8 +165,9 @@ def _run(options: argparse.Namespace) -> int:
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = {name: getattr(options, name) for name in LOOK if getattr(options, name) is not None}
-    if look or options.film is not None:
-        require_drawing(problem, draw=draw, **look)
+    seen = {name: value for name, value in look.items() if name != "caption"}
+    if look or options.film is not None or options.side_by_side:
+        require_drawing(problem, draw=None if options.side_by_side else draw, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)
     tell = say_nothing if options.quiet or options.json else say
 
@@ -176,6 +190,10 @@ def _run(options: argparse.Namespace) -> int:
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]
     if not options.no_video:
         written += pictures.write_video(solution, folder, draw, look)
+    if options.side_by_side:
+        from mjx_drax.view.video import render_comparison
+
+        written.append(render_comparison(solution, folder / "comparison.mp4", **seen).name)
     if film is not None:
         from mjx_drax.view.diffusion import render_diffusion
 

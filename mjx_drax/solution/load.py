@@ -328,7 +328,7 @@ def _inner_dynamics(summary: dict[str, Any], arrays: Arrays, further: int) -> Dy
     dt = summary["dt"]
     if "model.binary" not in arrays:
         nx, nu = (arrays[f"solution.trajectories.{z}"].shape[-1] for z in "xu")
-        names = {name: tuple(given) for name, given in summary.get("names", {}).items()}
+        names: Any = {name: tuple(given) for name, given in summary.get("names", {}).items()}
         sizes = _missing("f"), dt, nx - further, nu
         if summary.get("vector_states", True):
             return FunctionDynamics(*sizes, **names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,11 @@ Numbers = dict[str, Any]
 
 SHARES = ("feasible", "reaches goal", "with feedback", "escapes", "diverged", "rollout upright")
 """Columns that are printed as percentages, besides those about max|h|."""
+
+
+def tell(line: str) -> None:
+    """Say how far a figure is, on standard error, so that tables can be piped."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def reaching(solution: Solution) -> np.ndarray:
