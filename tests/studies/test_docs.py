@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import mjx_drax
+from mjx_drax import tasks
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -21,13 +22,21 @@ def test_every_public_name_is_documented(name):
     assert not text.startswith(f"{name}(")  # what dataclasses write by themselves
 
 
-@pytest.mark.slow
-def test_the_reference_has_every_public_name(tmp_path):
-    written = runpy.run_path(str(ROOT / "docs" / "make_reference.py"))["write"](tmp_path)
-    page = written.read_text(encoding="utf-8")
+def test_the_site_has_every_public_name_and_task(tmp_path):
+    site = runpy.run_path(str(ROOT / "docs" / "make_site.py"))
+    site["write"](tmp_path)
+    reference = (tmp_path / "reference.md").read_text(encoding="utf-8")
     for name in mjx_drax.__all__:
-        if not inspect.ismodule(getattr(mjx_drax, name)):  # these have pages of their own
-            assert f'id="{name}"' in page
+        if callable(getattr(mjx_drax, name)):
+            assert f".{name}\n" in reference
+    gallery = (tmp_path / "gallery.md").read_text(encoding="utf-8")
+    for name in tasks.names():
+        assert f"## {name}\n" in gallery
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in tmp_path.glob("*.md"):
+        assert page.name in menu
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            assert "://" in target or (tmp_path / target).exists(), (page.name, target)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

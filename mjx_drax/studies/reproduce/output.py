@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -57,7 +58,7 @@ def table(numbers: Mapping[str, Any]) -> str:
             lines = [names, ["---"] * len(names)]
             lines += [[_cell(name, row[name]) for name in names] for row in value]
             parts.append("\n".join(f"| {' | '.join(cells)} |" for cells in lines))
-    return "\n\n".join(parts).replace("max|h|", "max\\|h\\|")
+    return re.sub(r"\|h\|", r"\\|h\\|", "\n\n".join(parts))
 
 
 def _cell(name: str, value: Any) -> str:
