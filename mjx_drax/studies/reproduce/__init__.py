@@ -5,6 +5,7 @@
     multipliers       |h|^2 with and without multipliers, over mu
     theorem_2         mu*, where the flow is stable, and its energy, at the pendulum's optimum
     bug_trap          gradient descent, quasi-Newton and diffusion side by side
+    direct_against_shooting  random states, beside what dynamic programming says is possible
     parallel_table    N pendulums at once: time, and what the time bought
     open_questions    preconditioning, annealing, noise or none, sampled or exact gradients
 
@@ -29,6 +30,7 @@ NAMES = (
     "multipliers",
     "theorem-2",
     "bug-trap",
+    "direct-against-shooting",
     "parallel-table",
     "open-questions",
 )

@@ -18,7 +18,17 @@ if TYPE_CHECKING:
 
 Numbers = dict[str, Any]
 
-SHARES = ("feasible", "reaches goal", "with feedback", "escapes", "diverged", "rollout upright")
+SHARES = (
+    "upright",
+    "of those that can",
+    "within 1.2 times dynamic programming",
+    "feasible",
+    "reaches goal",
+    "with feedback",
+    "escapes",
+    "diverged",
+    "rollout upright",
+)
 """Columns that are printed as percentages, besides those about max|h|."""
 
 

@@ -79,10 +79,11 @@ class Optimum:
         """The least mu from which on the linearized flow is stable in continuous time."""
         return _threshold(lambda mu: bool(np.linalg.eigvals(self._flow(mu)).real.max() < 0.0))
 
-    def largest_step(self, mu: float) -> float:
-        """The largest alpha for which the linearized iteration is stable."""
-        grows = _threshold(lambda step: not self.decay(mu, step) > 0.0, low=1e-6, high=1.0)
-        return grows
+    def largest_step(self, mu: float) -> float | None:
+        """The largest alpha for which the linearized iteration is stable; None if none is."""
+        low = 1e-6
+        found = _threshold(lambda step: not self.decay(mu, step) > 0.0, low=low, high=1.0)
+        return None if found <= low else found
 
     def decay(self, mu: float, step: float) -> float:
         """By which share the slowest mode shrinks in an iteration; negative if one grows."""
@@ -293,7 +294,7 @@ def _energies(
 
     found, every = {}, max(1, iterations // 400)
     for mu in penalties:
-        alpha = 0.2 * optimum.largest_step(mu)
+        alpha = 0.2 * (optimum.largest_step(mu) or 0.0)
         values = np.asarray(run(jnp.asarray(alpha), jnp.asarray(mu)))
         values = values / values[0]
         found[f"{mu:g}"] = {
