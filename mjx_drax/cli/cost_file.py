@@ -42,7 +42,7 @@ Other names are yours. One that is nearly one of these is refused, as a spelling
 
 FUNCTION_ALIKE, VALUE_ALIKE = 0.77, 0.9
 """How much of a name has to be that of a known one to be taken for a slip: `final_cost` is one,
-the numbers `u_start` and `x_goal` are not."""
+the numbers `u_first` and `x_goal` are not."""
 
 
 def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restarts]:

@@ -7,14 +7,25 @@ factorization. Until the next plan arrives, the control at time t = t_0 + (k + w
 
 where x_plan(t) lies between x_k and x_{k+1}. The next plan starts from this one, s = (t - t_0) / dt
 knots later: knots, slacks and all multipliers move s places forward (between two places they are
-interpolated), and behind the last knot f goes on with the last control. A few iterations of the
-noise-free tail then bring it back to the dynamics from the state that was measured. All of this,
-and the choice of the best chain, is one compiled function; x, s and the number of iterations are
-traced, and only the best chain's plan comes to the host.
+interpolated), and behind the last knot f goes on with the last control. A few iterations then bring
+it back to the dynamics from the state that was measured: of the polish where the problem has
+constraints or a free duration, as after `solve(guess=solution)`; else of the flow's tail. All of
+this, and the choice of the best chain, is one compiled function; x, s and the number of iterations
+are traced, and only the best chain's plan comes to the host.
 
 Keepers are chains that go on like that. Explorers start from the best plan again and again, are
 heated, and cooled over several plans as in a solve, while the horizon recedes under them; one that
 becomes feasible and clearly cheaper takes the place of the worst keeper, and is applied.
+
+What a problem leaves open:
+
+    rates         are counted from the controls that the policy gave last; feedback between plans
+                  keeps the bounds of controls, not those of rates
+    parameters    every plan chooses its own (`MPC.parameters`)
+    duration      ends no later than at the first plan, so that less is left of it from plan to
+                  plan, but no plan is shorter than its lower bound: in the end the policy holds
+                  what the problem asks of the end. Controls are given by time along the plan, and
+                  `every` counts its steps
 
 A goal at the end of a horizon that recedes may never be reached: tomorrow is as good. So the
 terminal cost also runs along the horizon, with the weight `hold`.
@@ -43,16 +54,25 @@ from mjx_drax.base.errors import (
 )
 from mjx_drax.base.numbers import numbers
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.control.open_quantities import (
+    Applied,
+    counted_from,
+    is_constrained,
+    require_plannable,
+    step_of,
+    with_time_passed,
+)
 from mjx_drax.control.shift import shifted
 from mjx_drax.kernels.compilation import compiled, keep_programs
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
+from mjx_drax.polish.interior_point import Polish, Progress, begin_inside
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
-from mjx_drax.problem.trajectory import Knot, Trajectory
+from mjx_drax.problem.trajectory import Knot
 from mjx_drax.search.engine import Chains, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import (
@@ -65,9 +85,13 @@ from mjx_drax.search.iterate import (
     ranking,
 )
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.search.warm import resumed
 
 CHEAPER = 0.9
 """Another chain is applied if its cost is below that of the one applied by this factor."""
+
+ENDLESS = 10**6
+"""Iterations of the polish, of which none is the last one."""
 
 HEATED, CYCLE = 30, 50
 """Iterations of an explorer with noise, and of all, before it starts again."""
@@ -79,12 +103,13 @@ class Plan:
     """The best chain's plan.
 
     Attributes:
-        x: states x_0..x_K, (K + 1, nx).
+        x: states x_0..x_K, (K + 1, nx), with the further ones that the problem has.
         u: controls, (K, nu).
         gains: feedback K_k, (K, nu, ndx).
         cost, max_defect: of the plan, scalars.
         finite: whether it may be used.
         switched: whether another chain than the last plan's was the best.
+        dt: time between its knots [s].
         time: of x_0 [s]; set on the host.
     """
 
@@ -95,6 +120,7 @@ class Plan:
     max_defect: Any
     finite: Any
     switched: Any
+    dt: Any
     time: float = 0.0
 
 
@@ -172,6 +198,7 @@ class MPC:
 
         Args:
             problem: from `from_mjcf` or `from_function`; its x_init is replaced by what is given.
+                Its x_0 may not be free, numbers of its model no parameters, and it has one phase.
             chains: number of chains, explorers included.
             explorers: how many of them explore; by default half.
             iterations: of every chain for a plan.
@@ -204,11 +231,7 @@ class MPC:
                 f"bounds of {problem.name} differ from knot to knot, but the horizon recedes: "
                 "give the same ones for all, of shapes (nx,) and (nu,)."
             )
-        if problem.free or isinstance(problem.dynamics, Extended):
-            raise DraxError(
-                f"{problem.name} leaves x_0, parameters or its duration open, or reads rates: MPC "
-                "starts where the robot is and keeps dt; give a problem without."
-            )
+        require_plannable(problem)
         self.original, self.problem = problem, holding(problem, hold)
         self.solver = settled(self.problem, chains, seed, solver)
         metric = self.solver.flow.preconditioner
@@ -222,12 +245,18 @@ class MPC:
                 f"iterations is {iterations}, but the solver's tail has {self.solver.flow.tail}: "
                 "give fewer, or a longer tail."
             )
+        polish = self.solver.polish
+        self._polish: Polish | None = None
+        if polish is not None and polish.iterations and is_constrained(problem):
+            self._polish = replace(polish, iterations=ENDLESS)
         self.chains, self.explorers = chains, int(explorers)
         self.iterations, self.every, self.seed = iterations, every, seed
         self.statistics = Statistics()
         self.first_solve = 0.0
         self._plan: Plan | None = None
-        self._time = 0.0
+        self._time = self._began = 0.0
+        self._applied: Applied | None = None
+        self._further = np.asarray(self.problem.x_init)[problem.dynamics.given_nx :]
         self._start: tuple[Carried, Plan] | None = None
         self._lower, self._upper = (
             np.asarray(end, float) for end in (problem.bounds.u_lower, problem.bounds.u_upper)
@@ -244,6 +273,14 @@ class MPC:
             raise DraxError("there is no plan yet: call policy.reset(x), or policy(x, t).")
         return self._plan
 
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """The parameters of the plan in use, by name."""
+        dynamics = self.problem.dynamics
+        if not isinstance(dynamics, Extended):
+            return {}
+        return dynamics.parameters(dynamics.extras(np.asarray(self.latest.x[0])).p)
+
     def reset(self, x: ArrayLike, t: float = 0.0) -> Plan:
         """Solve from x (nx,) as `solve` does, and make that the plan at time t [s].
 
@@ -254,6 +291,7 @@ class MPC:
         """
         _require_time(t)
         problem = self.problem.with_x_init(x).at_time(t)
+        self._begin(t)
         clock = time.perf_counter()
         found = Search(Family.of_one(problem), self.chains, self.seed, self.solver).run()
         self._flow = found.flow
@@ -261,7 +299,7 @@ class MPC:
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
         )
         self._traced = jax.device_put(problem)
-        carried = _first(found.chains, self.explorers, self.seed)
+        carried = _first(found.chains, self.explorers, self.seed, self._polish)
         self._plan = None
         self._apply(carried, x, t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
@@ -275,6 +313,7 @@ class MPC:
             raise DraxError("there is nothing to go back to: call policy.reset(x) first.")
         _require_time(t)
         self._carried, plan = self._start
+        self._begin(t)
         self._plan, self._time = replace(plan, time=t), t
         self.statistics = Statistics()
         return self._plan
@@ -310,15 +349,24 @@ class MPC:
         """
         x = self._state(x)
         _require_time(t)
-        plan, K = self.latest, self.problem.horizon
-        s = np.clip((t - plan.time) / float(self.problem.dynamics.dt), 0.0, K)
+        plan, K, dynamics = self.latest, self.problem.horizon, self.problem.dynamics
+        step = float(plan.dt)
+        s = np.clip((t - plan.time) / step, 0.0, K)
         k = int(min(s + 1e-6, K - 1))
-        if not np.isfinite(x).all():
+        u = np.asarray(plan.u[k], float)
+        if np.isfinite(x).all():
+            further = np.asarray(plan.x[k, len(x) :], float)
+            planned = self._between(plan.x[k], plan.x[k + 1], s - k)[: len(x)]
+            v = self._last_controls(plan.time + k * step)
+            own = further if v is None else np.append(further[: len(further) - len(v)], v)
+            off = dynamics.host_difference(np.append(x, own), np.append(planned, further))
+            u = u + plan.gains[k] @ off
+        else:
             self.statistics.unmeasured += 1
-            return np.clip(np.asarray(plan.u[k], float), self._lower, self._upper)
-        planned = self._between(plan.x[k], plan.x[k + 1], s - k)
-        off = self.problem.dynamics.host_difference(x, planned)
-        return np.clip(plan.u[k] + plan.gains[k] @ off, self._lower, self._upper)
+        u = np.clip(u, self._lower, self._upper)
+        if self._applied is not None:
+            self._applied.add(u, t, min(t, plan.time) - 2 * step)
+        return u
 
     def __call__(self, x: ArrayLike, t: float) -> np.ndarray:
         """The control (nu,) at time t [s] for the state x (nx,), after a new plan if one is due."""
@@ -329,9 +377,9 @@ class MPC:
         return self.control(x, t)
 
     def due(self, t: float) -> bool:
-        """Whether `every` control steps have passed since the plan in use was made."""
+        """Whether `every` steps of the plan in use have passed since it was made."""
         _require_time(t)
-        steps = (t - self.latest.time) / float(self.problem.dynamics.dt)
+        steps = (t - self.latest.time) / self._step
         return steps > self.every - 1e-6
 
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
@@ -340,12 +388,18 @@ class MPC:
         number = self._traced.x_init.dtype.type
         scale = Scale(self._heated.scale.cost, number(np.sqrt(max(cost, 1e-12))))
         self._time = t  # of what is carried; the plan in use is older after one that failed
+        problem, whole = self._at(t), np.append(np.asarray(x, number), self._further)
+        if self._applied is not None:
+            v = self._applied.before(t, self._step)
+            problem = counted_from(problem, v, self._applied.any)
+            whole[len(whole) - len(v) :] = v
         self._carried, device = _plan(
             self._flow,
             replace(self._heated, scale=scale),
-            self._at(t),
+            self._polish,
+            problem,
             carried,
-            np.asarray(x, number),
+            whole,
             number(by),
             np.int32(self.iterations),
             self.explorers,
@@ -357,12 +411,32 @@ class MPC:
 
     def _at(self, t: float) -> Problem:
         """The problem at time t [s], with its numbers on the device."""
-        moved = self.problem.at_time(t)
-        return replace(self._traced, t_init=moved.t_init, data=moved.data)
+        moved, dynamics = self.problem.at_time(t), self.problem.dynamics
+        problem = replace(self._traced, t_init=moved.t_init, data=moved.data)
+        if isinstance(dynamics, Extended) and dynamics.phases:
+            return with_time_passed(problem, t - self._began)
+        return problem
+
+    def _last_controls(self, t: float) -> np.ndarray | None:
+        """Those before time t [s] that rates are counted from, (order * nu,); None without."""
+        if self._applied is None or not self._applied.any:
+            return None
+        return self._applied.before(t, self._step)
+
+    def _begin(self, t: float) -> None:
+        """Forget what was applied; a free duration begins at time t [s]."""
+        dynamics, self._began = self.problem.dynamics, t
+        if isinstance(dynamics, Extended) and dynamics.order:
+            self._applied = Applied(dynamics)
+
+    @property
+    def _step(self) -> float:
+        """Time between the knots of the plan in use [s]."""
+        return float(self.problem.dynamics.dt if self._plan is None else self._plan.dt)
 
     def _state(self, x: ArrayLike) -> np.ndarray:
         """A state as it was measured, (nx,) numbers that need not be finite."""
-        nx = self.problem.dynamics.nx
+        nx = self.problem.dynamics.given_nx
         try:
             state = numbers(x)
         except (TypeError, ValueError) as error:
@@ -415,18 +489,21 @@ def _held_residual(
     return jnp.concatenate([jnp.ravel(at_knot(running, knot)(seen, u)), held])
 
 
-def _first(found: Chains, explorers: int, seed: int) -> Carried:
+def _first(found: Chains, explorers: int, seed: int, polish: Polish | None) -> Carried:
     """The chains of a solve, the best ones as keepers; the explorers at all ages.
 
-    They go on with the flow's tail, not with the polish.
+    The polish of explorers begins when they become keepers.
     """
     info, chains = found.info, len(found.cost)
     count = chains - explorers
     age = np.zeros(chains, np.int32)
     age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
     order = np.lexsort(ranking(info.cost, info.max_defect)[::-1])
+    state = _rows(found.state, order)
+    if polish is None:
+        state = replace(state, polish=())
     return Carried(
-        replace(_rows(found.state, order), polish=()),
+        _begun_anew(state, jnp.arange(chains) >= count),
         jnp.int32(0),
         jnp.array(False),
         jnp.int32(count - 1),
@@ -446,6 +523,7 @@ def _rows(state: State, which: ArrayLike) -> State:
 def _plan(
     flow: Langevin,
     heated: Langevin,
+    polish: Polish | None,
     problem: Problem,
     carried: Carried,
     x: Array,
@@ -462,22 +540,22 @@ def _plan(
         key, fresh = jax.random.split(key)
         state = _restarted(heated, problem, state, best, exploring & (age == 0), fresh)
     state = _led_back(flow, problem, state, carried)
-    total = jnp.int32(flow.iterations + flow.tail)
-    start = jnp.where(exploring, age, total - iterations)
-    state = _iterated(flow, heated, problem, state, exploring, start, iterations, explorers > 0)
+    state = _iterated(flow, heated, polish, problem, state, age, iterations, explorers)
     age = jnp.where(exploring & (age + iterations < CYCLE), age + iterations, 0)
     info = evaluate(problem, state.trajectory)
     alive = state.alive & jnp.isfinite(info.cost) & jnp.isfinite(info.max_defect)
     cost = jnp.where(alive & (info.max_defect < FEASIBLE), info.cost, jnp.inf)
     chosen = _chosen(info, cost, alive, best)
+    states = problem.with_start(state.trajectory)[chosen]
     plan = Plan(
-        x=problem.with_start(state.trajectory)[chosen],
+        x=states,
         u=state.trajectory.u[chosen],
         gains=state.gains[chosen],
         cost=info.cost[chosen],
         max_defect=info.max_defect[chosen],
         finite=alive[chosen],
         switched=chosen != best,
+        dt=step_of(problem, states),
     )
     # An explorer that is applied becomes a keeper, and so does whatever replaces the dead
     worst = jnp.argmax(jnp.where(exploring, -jnp.inf, cost))
@@ -511,10 +589,12 @@ def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) 
     best = carried.best
     knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
     x, u = problem.rolled_out(knots, gains)
-    rolled = Trajectory(jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0))
+    x, u = jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0)
+    rolled = replace(knots, x=x, u=u)
     everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
     inside = jax.vmap(partial(flow.inside, problem))(everyone)
     moved = replace(state, trajectory=inside, damping=jnp.ones_like(state.damping))
+    moved = _begun_anew(moved, state.alive)
     which = carried.lost & (carried.spare != best) & (jnp.arange(len(state.alive)) == carried.spare)
     return _where(which, moved, state)
 
@@ -526,7 +606,7 @@ def _restarted(
     knots = jax.tree.map(lambda a: jnp.broadcast_to(a[best], a.shape), state.trajectory)
     keys = chain_keys(key, len(which))
     started = jax.vmap(partial(heated.init, problem))(replace(knots, slack=None), keys)
-    return _where(which, started, state)
+    return _where(which, replace(started, polish=state.polish), state)
 
 
 def _where(which: Array, new: State, old: State) -> State:
@@ -538,24 +618,78 @@ def _where(which: Array, new: State, old: State) -> State:
     return jax.tree.map(chosen, new, old)
 
 
+def _begun_anew(state: State, which: Array) -> State:
+    """Some chains (chains,) have other knots than their polish has known."""
+    if not isinstance(state.polish, Progress):
+        return state
+    return replace(state, polish=replace(state.polish, stalled=state.polish.stalled | which))
+
+
 def _iterated(
+    flow: Langevin,
+    heated: Langevin,
+    polish: Polish | None,
+    problem: Problem,
+    state: State,
+    age: Array,
+    iterations: Array,
+    explorers: int,
+) -> State:
+    """So many iterations of every chain: of the polish, else of the tail; of an explorer's flow.
+
+    Explorers are the last chains, and go on from their `age` (chains,).
+    """
+    keepers = len(age) - explorers
+    if polish is None:  # one loop for all: where f has contacts, each takes long to compile
+        return _flowed(flow, heated, problem, state, age, iterations, explorers)
+    kept, others = (
+        jax.tree.map(lambda a, part=part: a[part], state)
+        for part in (slice(keepers), slice(keepers, None))
+    )
+    kept = jax.vmap(partial(_resumed, flow, problem))(kept)
+    question = Question(replace(flow, iterations=0), problem, np.int32(0), polish)
+    shared, own = partition(question, None)
+    kept = loop((kept, own), shared, 0, iterations, diagnose=False)[0]
+    if not explorers:
+        return kept
+    others = _flowed(flow, heated, problem, others, age[keepers:], iterations, explorers)
+    whole: State = jax.tree.map(lambda *parts: jnp.concatenate(parts), kept, others)
+    return whole
+
+
+def _flowed(
     flow: Langevin,
     heated: Langevin,
     problem: Problem,
     state: State,
-    exploring: Array,
-    start: Array,
+    age: Array,
     iterations: Array,
-    noise: bool,
+    explorers: int,
 ) -> State:
-    """So many iterations of every chain, from its own `start` (chains,) in its own schedules."""
+    """So many iterations of keepers in the tail, and of explorers in their own schedules."""
+    exploring = jnp.arange(len(age)) >= len(age) - explorers
 
     def own(old: Array, new: Array) -> Array:
         which = exploring.reshape(-1, *[1] * jnp.ndim(old))
         return jnp.where(which, jnp.asarray(new), jnp.asarray(old))
 
+    start = jnp.where(exploring, age, jnp.int32(flow.iterations + flow.tail) - iterations)
     question = Question(jax.tree.map(own, flow, heated), problem, start)
     sizes = [len(jax.tree.leaves(part)) for part in question]
     differs = (True,) * sizes[0] + (False,) * sizes[1] + (True,)
     shared, rows = partition(question, differs)
-    return loop((state, rows), shared, 0, iterations, noise=noise, diagnose=False)[0]
+    return loop((state, rows), shared, 0, iterations, noise=explorers > 0, diagnose=False)[0]
+
+
+def _resumed(flow: Langevin, problem: Problem, state: State) -> State:
+    """A chain as a warm start of the polish; one that was blocked is led off its bounds.
+
+    Steps of an interior point method are short where knots are at their bounds and have to leave
+    them.
+    """
+    old, rho = state.polish, flow.weights(1.0).barrier
+    inside = replace(state, trajectory=flow.inside(problem, state.trajectory))
+    fresh = begin_inside(problem, inside, rho)
+    fresh = replace(fresh, polish=replace(fresh.polish, stiffness=old.stiffness))
+    warm = resumed(problem, state)
+    return jax.tree.map(lambda a, b: jnp.where(old.blocked, a, b), fresh, warm)

@@ -85,7 +85,8 @@ class Plant:
         self.model.body_inertia[:] *= mass
         self.data = mujoco.MjData(self.model)
         mujoco.mj_setConst(self.model, self.data)
-        set_state(self.model, self.data, np.asarray(problem.x_init, float))
+        start = np.asarray(problem.x_init, float)[: problem.dynamics.given_nx]
+        set_state(self.model, self.data, start)
         self.noise, self.shaking = noise, shaking
         self._pushes = [(p, index(self.model, "body", p.body)) for p in pushes]
         self._random = np.random.default_rng(seed)

@@ -18,7 +18,9 @@ from mjx_drax.base.errors import DraxError, require_positive, require_whole
 from mjx_drax.base.files import complete
 from mjx_drax.control.background import Background
 from mjx_drax.control.mpc import MPC, Statistics
+from mjx_drax.control.open_quantities import driven
 from mjx_drax.control.plant import Plant, Push, random_pushes
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 
 SETTLE = 4.0
@@ -41,6 +43,7 @@ class Motion:
         statistics: of the policy.
         reached: whether the run ended in the goal; None without a goal.
         pushes: what it had to bear.
+        further: the further states of the problem in the plan in use, (T, n).
     """
 
     times: np.ndarray
@@ -49,6 +52,7 @@ class Motion:
     statistics: Statistics
     reached: bool | None
     pushes: Sequence[Push]
+    further: np.ndarray
 
 
 def simulate(
@@ -87,12 +91,13 @@ def _driven(
     realtime: bool,
     pushes: Sequence[Push],
 ) -> Motion:
-    times, states, controls = [plant.time], [plant.state], []
+    times, states, controls, further = [plant.time], [plant.state], [], []
     began = time.perf_counter() - plant.time
     while plant.time < duration - 1e-9:
         u = act(plant.measured(), plant.time)
         plant.step(u)
         controls.append(u)
+        further.append(policy.latest.x[0, len(plant.state) :])
         times.append(plant.time)
         states.append(plant.state)
         if realtime:
@@ -100,7 +105,7 @@ def _driven(
     end = states[-1]
     reached = policy.problem.reached(end) if np.isfinite(end).all() else False
     found = np.array(times), np.array(states), np.array(controls)
-    return Motion(*found, policy.statistics, reached, pushes)
+    return Motion(*found, policy.statistics, reached, pushes, np.array(further))
 
 
 @dataclass(frozen=True)
@@ -194,10 +199,15 @@ class Trials:
 def _cost(policy: MPC, motion: Motion) -> float:
     """phi at the end plus the running cost at the start of every control step that was driven."""
     problem = policy.original
-    each = round(float(problem.dynamics.dt) / (motion.times[1] - motion.times[0]))
-    x, u = jnp.asarray(motion.states[:-1:each]), jnp.asarray(motion.controls[::each])
-    total = jax.jit(_total)(problem, x, u, jnp.asarray(motion.states[-1]))
-    return float(total)
+    dynamics = problem.dynamics
+    each = round(float(dynamics.dt) / (motion.times[1] - motion.times[0]))
+    x, u = np.append(motion.states[:-1:each], motion.states[-1:], axis=0), motion.controls[::each]
+    if isinstance(dynamics, Extended):
+        further = np.append(motion.further[::each], motion.further[-1:], axis=0)
+        x = driven(dynamics, np.append(x, further, axis=1), u)
+        phases = (len(u),) * len(dynamics.phases)
+        problem = replace(problem, dynamics=replace(dynamics, phases=phases))
+    return float(jax.jit(_total)(problem, *map(jnp.asarray, (x[:-1], u, x[-1]))))
 
 
 def _total(problem: Problem, x: jax.Array, u: jax.Array, end: jax.Array) -> jax.Array:

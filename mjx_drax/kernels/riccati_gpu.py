@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mjx_drax.kernels import riccati_blocks
 from mjx_drax.kernels.batching import (
     merged_vmaps,
     of_one_precision,
@@ -51,7 +52,8 @@ MAX_NDX, MAX_NU = 6, 4
 def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
     """Decorator of the Newton step of one chain, whose vmap is one kernel where that pays.
 
-    That is on GPUs, in one precision, for blocks of at most MAX_NDX and MAX_NU. The arrays of the
+    That is on GPUs, in one precision, for blocks of at most MAX_NDX and MAX_NU, and larger ones of
+    float32 as far as `riccati_blocks` goes. The arrays of the
     step's arguments are, in their order, those of `newton_steps`; it returns
     result(dx=, du=, nx=, nu=, rate=, K=).
     """
@@ -59,25 +61,31 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
     def decorate(newton: Callable[..., Any]) -> Callable[..., Any]:
         plain = jax.vmap(newton)
 
-        def kernel(*arguments: Any) -> Any:
-            return result(**newton_steps(*jax.tree.leaves(arguments)))
-
         def all_chains(has_rows: tuple[bool, ...], *arguments: Any) -> Any:
             arguments = repeated(has_rows, arguments)
-            if on_gpu() and _fits(*jax.tree.leaves(arguments)):
-                return lax.platform_dependent(*arguments, cuda=kernel, default=plain)
-            return plain(*arguments)
+            steps = kernel_for(*jax.tree.leaves(arguments)) if on_gpu() else None
+            if steps is None:
+                return plain(*arguments)
+
+            def kernel(*arguments: Any) -> Any:
+                return result(**steps(*jax.tree.leaves(arguments)))
+
+            return lax.platform_dependent(*arguments, cuda=kernel, default=plain)
 
         return update_wrapper(merged_vmaps(newton, all_chains), newton)
 
     return decorate
 
 
-def _fits(A: Array, B: Array, *rest: Array) -> bool:
-    """Whether the kernel is made for such blocks."""
+def kernel_for(A: Array, B: Array, *rest: Array) -> Callable[..., Any] | None:
+    """The kernel that is made for such blocks, if there is one."""
     ndx, nu = B.shape[-2:]
-    small = 0 < ndx <= MAX_NDX and 0 < nu <= MAX_NU
-    return small and of_one_precision((A, B, *rest))
+    if min(ndx, nu) == 0 or not of_one_precision((A, B, *rest)):
+        return None
+    if ndx <= MAX_NDX and nu <= MAX_NU:
+        return newton_steps
+    blocks = ndx <= riccati_blocks.MAX_NDX and nu <= riccati_blocks.MAX_NU
+    return riccati_blocks.newton_steps if blocks and A.dtype == np.float32 else None
 
 
 def newton_steps(

@@ -24,7 +24,7 @@ and S are at hand. Newton step and noise are hence two solutions of one affine r
 
 that GPUs solve in parallel over time. Shapes: all arrays carry the stage axis K first.
 
-With thousands of chains on a GPU one kernel does the same, stage by stage (`kernels.riccati_gpu`).
+Many chains on a GPU are done by kernels, stage by stage (`kernels.riccati_gpu`, `riccati_blocks`).
 """
 
 from __future__ import annotations

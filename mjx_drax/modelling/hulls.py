@@ -7,9 +7,11 @@ A hull is the intersection of half-spaces n_i . p <= o_i. Inside, the distance o
 outside it is the same over the face that p projects into, else the distance from an edge. Which
 values are exact:
 
-    plane, sphere, capsule    exact
-    box                       exact where they overlap; apart, a lower bound of at least 1/sqrt(3)
-                              of the distance
+    plane, sphere, capsule, mesh    exact
+    box                             exact where they overlap; apart, a lower bound of at least
+                                    1/sqrt(3) of the distance
+    cylinder, ellipsoid             lower bounds: a hull of points on them stands in, less by e,
+                                    2 % of a cylinder's radius, 6 % of an ellipsoid's largest one
 
 The hull is the one that the C engine has. If it has more than VERTICES vertices, it is replaced by
 the hull of some of them, and distances are less by the largest distance e of the others from it:
@@ -17,7 +19,7 @@ lower bounds, at most e too small. For round meshes e is about 5 % of their size
 
 First and second derivatives are finite everywhere; the nearest point of a capsule's axis is not
 differentiated, as in `distances`. A capsule takes about a hundred times as long with a mesh as with
-a box: use primitive shapes where they fit.
+a box, and two meshes look at all pairs of their edges: use primitive shapes where they fit.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ from mjx_drax.base.errors import DraxError, reason
 from mjx_drax.modelling.distances import (
     BOX,
     CAPSULE,
+    CYLINDER,
     PLANE,
     SPHERE,
     Shape,
@@ -43,9 +46,15 @@ from mjx_drax.modelling.distances import (
 )
 from mjx_drax.physics.engine import mujoco
 
-MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+MESH, ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 VERTICES = 64
 """Vertices of a hull, at most; it has about twice as many triangles."""
+
+CORNERS = 16
+"""Vertices on each rim of the hull that stands in for a cylinder."""
+
+AT_ONCE = 16
+"""Vertices or edges of one hull that are compared with another hull at a time."""
 
 
 class Hull(NamedTuple):
@@ -86,7 +95,30 @@ def hull_of(model: mujoco.MjModel, mesh: int) -> Hull:
     if model.mesh_graphadr[mesh] >= 0:  # those of the hull that the C engine has
         used, _ = _of_graph(model.mesh_graph[model.mesh_graphadr[mesh] :])
         points = points[used]
-    vertices, faces = _triangles(points, model.mesh(mesh).name)
+    hull = _hull(points, model.mesh(mesh).name)
+    apart = jax.jit(lambda hull, points: lax.map(partial(_to_hull, hull), points, batch_size=256))
+    return hull._replace(excess=jnp.maximum(apart(hull, jnp.asarray(points)).max(), 0.0))
+
+
+def stand_in(kind: int, size: np.ndarray) -> Hull:
+    """The hull of points on a cylinder or on an ellipsoid of MuJoCo's size (3,)."""
+    if kind == CYLINDER:
+        angle = 2 * np.pi * (np.arange(CORNERS) + 0.5) / CORNERS
+        rim = size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        ends = [np.insert(rim, 2, side * size[1], axis=1) for side in (-1, 1)]
+        excess = size[0] * (1 - np.cos(np.pi / CORNERS))
+        return _hull(np.concatenate(ends), "cylinder")._replace(excess=jnp.asarray(excess))
+    k = np.arange(VERTICES)  # evenly spread over the unit sphere
+    z, angle = 1 - (2 * k + 1) / VERTICES, np.pi * (1 + np.sqrt(5)) * k
+    points = np.stack([np.cos(angle), np.sin(angle), z], axis=-1)
+    points[:, :2] *= np.sqrt(1 - z**2)[:, None]
+    missing = 1 - _hull(points, "ellipsoid").offsets.min()
+    return _hull(points * size, "ellipsoid")._replace(excess=missing * size.max())
+
+
+def _hull(points: np.ndarray, name: str) -> Hull:
+    """The hull of points (n, 3), of which some may be left out."""
+    vertices, faces = _triangles(points, name)
     corners = vertices[faces]
     sides = np.roll(corners, -1, axis=1) - corners
     normals = np.cross(sides[:, 0], sides[:, 1])
@@ -105,21 +137,23 @@ def hull_of(model: mujoco.MjModel, mesh: int) -> Hull:
     turn *= np.linalg.norm(bend, axis=1, keepdims=True) > 1e-5
     arcs = turn[..., None] * np.stack([np.cross(edges, one), np.cross(other, edges)], axis=1)
     parts = vertices, *(part[wide] for part in planes), starts, edges, arcs, 0.0
-    hull = Hull(*map(jnp.asarray, parts))
-    apart = jax.jit(lambda hull, points: lax.map(partial(_to_hull, hull), points, batch_size=256))
-    return hull._replace(excess=jnp.maximum(apart(hull, jnp.asarray(points)).max(), 0.0))
+    return Hull(*map(jnp.asarray, parts))
 
 
 def hulls_of(model: mujoco.MjModel, geoms: Sequence[int]) -> Hull:
-    """The hulls of geoms that are meshes: arrays with one more axis, before their own.
+    """The hulls of geoms of one kind, or their stand-ins: arrays with one more axis in front.
 
     The last rows of smaller hulls are repeated.
 
     Raises:
         DraxError: a mesh has no volume.
     """
-    meshes = [int(model.geom_dataid[geom]) for geom in geoms]
-    made = {mesh: hull_of(model, mesh) for mesh in set(meshes)}
+    kinds = [int(model.geom_type[geom]) for geom in geoms]
+    of = [int(model.geom_dataid[g]) if k == MESH else g for g, k in zip(geoms, kinds, strict=True)]
+    found = {
+        each: hull_of(model, each) if kind == MESH else stand_in(kind, model.geom_size[each])
+        for each, kind in dict(zip(of, kinds, strict=True)).items()
+    }
 
     def stack(*parts: Array) -> Array:
         if parts[0].ndim:
@@ -127,7 +161,7 @@ def hulls_of(model: mujoco.MjModel, geoms: Sequence[int]) -> Hull:
             parts = tuple(part[np.minimum(rows, len(part) - 1)] for part in parts)
         return jnp.stack(parts)
 
-    return jax.tree.map(stack, *(made[mesh] for mesh in meshes))
+    return jax.tree.map(stack, *(found[each] for each in of))
 
 
 def _triangles(points: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -222,6 +256,85 @@ def _box_mesh(box: Shape, mesh: Shape) -> Array:
     return _largest_gap(mesh.size, centre, frame.T, box.size) - mesh.size.excess
 
 
+def _mesh_mesh(one: Shape, other: Shape) -> Array:
+    """Apart: from a vertex to the other hull, or between two edges. Else the largest gap."""
+    a, b = one.size, _placed(other.size, *other.seen_from(one))
+    known = lax.stop_gradient((a, b))
+    i, j = (_nearest_vertex(*pair) for pair in (known, known[::-1]))
+    (k, m, sign), (p, q, s, t) = _edges_of(*known)
+    across = sign * _across(a.edges[k], b.edges[m]) @ (b.starts[m] - a.starts[k])
+    gaps = _beyond_faces(a, b), _beyond_faces(b, a), jnp.where(sign == 0, -jnp.inf, across)
+    between = a.starts[p] + s * a.edges[p] - b.starts[q] - t * b.edges[q]
+    nearest = _to_hull(b, a.vertices[i]), _to_hull(a, b.vertices[j]), norm(between)
+    gap, apart = jnp.stack(gaps), jnp.stack(nearest)
+    gap = gap[jnp.argmax(lax.stop_gradient(gap))]
+    apart = apart[jnp.argmin(lax.stop_gradient(apart))]
+    return jnp.where(gap > 0, apart, gap) - a.excess - b.excess
+
+
+def _placed(hull: Hull, centre: Array, frame: Array) -> Hull:
+    """A hull in another frame, in which its own has this centre and these axes."""
+    normals, sides = hull.normals @ frame.T, hull.sides @ frame.T
+    return Hull(
+        hull.vertices @ frame.T + centre,
+        normals,
+        hull.offsets + normals @ centre,
+        sides,
+        hull.side_offsets + sides @ centre,
+        hull.starts @ frame.T + centre,
+        hull.edges @ frame.T,
+        hull.arcs @ frame.T,
+        hull.excess,
+    )
+
+
+def _beyond_faces(a: Hull, b: Hull) -> Array:
+    """Largest distance of a hull b from the plane of a face of a hull a."""
+    heights = lax.stop_gradient(b.vertices @ a.normals.T)  # (vertices, faces)
+    face = jnp.argmax(heights.min(axis=0) - lax.stop_gradient(a.offsets))
+    lowest = jnp.argmin(heights[:, face])
+    return a.normals[face] @ b.vertices[lowest] - a.offsets[face]
+
+
+def _nearest_vertex(a: Hull, b: Hull) -> Array:
+    """Number of the vertex of a that is nearest to b."""
+    return jnp.argmin(lax.map(partial(_to_hull, b), a.vertices, batch_size=AT_ONCE))
+
+
+def _edges_of(a: Hull, b: Hull) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Edges of a and of b that span the face with the largest gap, and those that are nearest.
+
+    For the first the sign of their product, which leads from a to b, 0 without such a face; for the
+    second where on them the nearest points are, from 0 to 1.
+    """
+
+    def with_edge(own: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+        start, edge, arcs = own
+        normals = jax.vmap(partial(_across, edge))(b.edges)
+        of_a, of_b = normals @ arcs.T, jnp.einsum("esk,ek->es", b.arcs, normals)
+        ahead = jnp.concatenate([of_a, -of_b], axis=1)
+        sign = jnp.where((ahead > 0).all(1), 1.0, jnp.where((ahead < 0).all(1), -1.0, 0.0))
+        gaps = sign * jnp.sum(normals * (b.starts - start), axis=1)
+        m = jnp.argmax(jnp.where(sign == 0, -jnp.inf, gaps))
+        gap = jnp.where(sign[m] == 0, -jnp.inf, gaps[m])
+
+        def between(other: Array, along: Array) -> tuple[Array, Array, Array]:
+            w = start + edge / 2 - other - along / 2
+            s, t = nearest_of_segments(w, edge / 2, along / 2)
+            square = jnp.sum(jnp.square(w + s[:, None] * edge / 2 - t[:, None] * along / 2), axis=1)
+            one = jnp.argmin(square)
+            return square[one], (1 + s[one]) / 2, (1 + t[one]) / 2
+
+        squares, s, t = jax.vmap(between)(b.starts, b.edges)
+        q = jnp.argmin(squares)
+        return gap, m, sign[m], squares[q], q, s[q], t[q]
+
+    found = lax.map(with_edge, (a.starts, a.edges, a.arcs), batch_size=AT_ONCE)
+    gaps, m, sign, squares, q, s, t = found
+    k, p = jnp.argmax(gaps), jnp.argmin(squares)
+    return (k, m[k], sign[k]), (p, q[p], s[p], t[p])
+
+
 def _largest_gap(hull: Hull, centre: Array, axes: Array, sizes: Array) -> Array:
     """Largest distance of a point from the planes of the faces of a sum of shapes.
 
@@ -266,5 +379,11 @@ HULL_DISTANCES: dict[tuple[int, int], Callable[[Shape, Shape], Array]] = {
     (SPHERE, MESH): _sphere_mesh,
     (CAPSULE, MESH): _capsule_mesh,
     (BOX, MESH): _box_mesh,
+    (ELLIPSOID, MESH): _mesh_mesh,
+    (CYLINDER, MESH): _mesh_mesh,
+    (MESH, MESH): _mesh_mesh,
 }
-"""Like `distances.DISTANCES`, for geoms whose second is a mesh with a hull."""
+"""Like `distances.DISTANCES`, for geoms whose second has a hull, and whose first may have one."""
+
+HULLS = ELLIPSOID, CYLINDER, MESH
+"""Kinds of geoms that have a hull beside a mesh."""

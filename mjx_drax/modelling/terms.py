@@ -26,7 +26,7 @@ from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.base.numbers import numbers as real_numbers
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.modelling.distances import DISTANCES, SPHERE, Shape
-from mjx_drax.modelling.hulls import HULL_DISTANCES, MESH, hulls_of
+from mjx_drax.modelling.hulls import HULL_DISTANCES, HULLS, MESH, hulls_of
 from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
@@ -244,8 +244,8 @@ class Terms:
 
         One value for each of `geoms` with each of `others`, which vary fastest. Distances
         are signed; `modelling.distances` says for which pairs they are exact (all but two kinds).
-        A mesh counts as its convex hull, and has distances from planes, spheres, capsules and
-        boxes: `modelling.hulls`.
+        A mesh counts as its convex hull, and has distances from all other kinds but height
+        fields: `modelling.hulls`.
 
         Args:
             geoms: name or names.
@@ -274,8 +274,9 @@ class Terms:
         used = []
         for kinds, group in groups.items():
             firsts, seconds, _ = map(list, zip(*group, strict=True))
-            mesh = kinds[1] == MESH
-            used.append((sizes[firsts], hulls_of(model, seconds) if mesh else sizes[seconds]))
+            both = zip(kinds, (firsts, seconds), strict=True)
+            hulled = HULLS if MESH in kinds else ()
+            used.append(tuple(hulls_of(model, g) if k in hulled else sizes[g] for k, g in both))
         return _term(_clearance, (where, order), (wanted, *used), "clearance", len(pairs), 1.0)
 
     def _pose(

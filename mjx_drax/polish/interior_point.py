@@ -150,6 +150,24 @@ class Progress:
         """Whether the chain still moves."""
         return ~(self.optimal | self.stalled)
 
+    @property
+    def blocked(self) -> Array:
+        """Whether the chain stands, or nearly so, where it should not."""
+        return self.stalled | ((self.size < BLOCKED) & ~self.optimal)
+
+    def again(self, barrier: Array) -> Progress:
+        """The same for a chain that is to move on, with another weight of the barrier."""
+        zero, no = jnp.zeros_like(self.size), jnp.zeros_like(self.optimal)
+        return replace(
+            self,
+            barrier=barrier,
+            residual=jnp.full_like(self.residual, jnp.inf),
+            size=zero,
+            promise=jnp.ones_like(self.promise),
+            optimal=no,
+            stalled=no,
+        )
+
 
 def begin(problem: Problem, state: State) -> State:
     """The chain with what the polish carries."""
@@ -171,6 +189,13 @@ def begin(problem: Problem, state: State) -> State:
         stalled=no,
     )
     return replace(state, polish=progress)
+
+
+def begin_inside(problem: Problem, state: State, rho: Array) -> State:
+    """`begin` for knots that are inside the bounds: rho is the barrier's weight from the start."""
+    v = _central(problem, state.trajectory, rho)
+    state = begin(problem, replace(state, multipliers=replace(state.multipliers, bounds=v)))
+    return replace(state, polish=replace(state.polish, barrier=rho))
 
 
 def projected(problem: Problem, state: State) -> State:

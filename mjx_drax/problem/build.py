@@ -274,7 +274,8 @@ def assembled(
         parts = extend(choices, dynamics, given, x_init, bounds, scatter)
         dynamics, given, x_init, bounds, scatter, free = parts
     x, u, t_init = jnp.zeros(dynamics.nx), jnp.zeros(dynamics.nu), jnp.zeros(())
-    here = Knot(t_init, jnp.zeros((), int), jnp.asarray(dynamics.dt, float), first, x_init)
+    zero, dt = jnp.zeros((), int), jnp.asarray(dynamics.dt, float)
+    here = Knot(t_init, zero, dt, first, x_init, stage=zero)
     seen = jax.eval_shape(dynamics.at(here).observe, x, u)
     stage = given["equality"], given["inequality"]
     end = given["terminal_equality"], given["terminal_inequality"]

@@ -53,22 +53,22 @@ class Extended(Dynamics):
         inner: the system that a user gave.
         nominal: w, p and h of x'_init, (n0 + np + phases,).
         u_init: control before the first knot, (nu,).
+        starts_known: whether u_init counts, traced; else the first rate is 0.
         free: the tangent coordinates of x_0 that w moves.
         shapes: names and shapes of the parameters.
         phases: numbers of knots of the phases of free duration; () where dt is fixed.
         order: of the rates that knots know: 0 none, 1 rate, 2 jerk as well.
-        starts_known: whether u_init counts; else the first rate is 0.
         knot: the one that `at` has bound this to.
     """
 
     inner: Dynamics
     nominal: Array
     u_init: Array
+    starts_known: bool
     free: tuple[int, ...] = field(metadata=Static)
     shapes: tuple[tuple[str, tuple[int, ...]], ...] = field(metadata=Static)
     phases: tuple[int, ...] = field(metadata=Static)
     order: int = field(metadata=Static)
-    starts_known: bool = field(metadata=Static)
     knot: Knot | None = None
 
     @property
@@ -140,13 +140,13 @@ class Extended(Dynamics):
         """The knot of (x', u), with all that functions may ask it for."""
         knot, own = self.knot, self.extras(x)
         assert knot is not None  # for the type checker: `at` comes first
-        time, dt = knot.time, knot.dt
+        k, time, dt = knot.stage, knot.time, knot.dt
         if self.phases:
             count = np.array(self.phases)
             starts = np.cumsum(count) - count
-            past = jnp.clip(knot.index - starts, 0, count)
-            time = knot.time - knot.index * knot.dt + jnp.dot(own.h, past.astype(own.h.dtype))
-            dt = own.h[jnp.maximum(jnp.sum(knot.index >= starts) - 1, 0)]
+            past = jnp.clip(k - starts, 0, count)
+            time = knot.time - k * knot.dt + jnp.dot(own.h, past.astype(own.h.dtype))
+            dt = own.h[jnp.maximum(jnp.sum(k >= starts) - 1, 0)]
         change = jnp.zeros(self.inner.ndx).at[np.array(self.free, int)].set(own.w)
         start = self.inner_state(knot.x_init)
         first = self.inner.integrate(start, change) if self.free else start
@@ -154,11 +154,11 @@ class Extended(Dynamics):
         if not self.order:
             return here
         before = own.v.reshape(self.order, self.nu)
-        known = self.starts_known | (knot.index > 0)
+        known = self.starts_known | (k > 0)
         rate = jnp.where(known, (u - before[0]) / dt, 0.0)
         if self.order == 1:
             return replace(here, rate=rate)
-        known = self.starts_known | (knot.index > 1)
+        known = self.starts_known | (k > 1)
         jerk = jnp.where(known, (rate - (before[0] - before[1]) / dt) / dt, 0.0)
         return replace(here, rate=rate, jerk=jerk)
 

@@ -101,7 +101,7 @@ class Problem:
         k, dt = jnp.arange(self.horizon + 1), jnp.asarray(self.dynamics.dt, self.x_init.dtype)
         first = jnp.round(self.t_init / dt).astype(k.dtype)
         steps, start = jnp.broadcast_to(dt, k.shape), jnp.tile(self.x_init, (len(k), 1))
-        return Knot(self.t_init + dt * k, first + k, steps, self.data, start)
+        return Knot(self.t_init + dt * k, first + k, steps, self.data, start, stage=k)
 
     def at(self, knot: Knot) -> Problem:
         """The problem with all functions of a stage, or of the end, bound to one knot."""

@@ -33,6 +33,7 @@ class Knot:
         parameters: what was chosen for the whole motion, by name; None without.
         rate: (u_k - u_{k-1}) / dt, (nu,), where rates are asked for; None at the end.
         jerk: the same of the rate.
+        stage: k, counted from x_0; it differs from `index` where x_0 is not at time 0.
     """
 
     time: Array
@@ -43,6 +44,7 @@ class Knot:
     parameters: Any = None
     rate: Any = None
     jerk: Any = None
+    stage: Any = None
 
     def at(self, which: Any) -> Knot:
         """One knot of several, or a slice of them."""

@@ -40,7 +40,6 @@ from mjx_drax.search.iterate import (
     Question,
     begin,
     chain_keys,
-    evaluate,
     iterate,
     joined,
     noise_at,
@@ -281,17 +280,13 @@ class Search:
 
     def _no_worse(self, found: Chains) -> Chains:
         """What was found; for a chain whose guess was feasible and better, the guess."""
-        problem, guess = self.family.problem, self.guess
-        given = guess.knots if isinstance(guess, Warm) else guess
-        knots = initial_knots(problem, self.chains, given, jax.random.key(0))
-        info = evaluate(problem, replace(knots, slack=None))
-        state = replace(found.state, trajectory=replace(knots, slack=found.state.trajectory.slack))
-        gains = guess.gains if isinstance(guess, Warm) else jnp.zeros_like(state.gains)
-        state = replace(state, gains=gains)
+        knots, keys = self._drawn(0, self.indices)
+        state = self._begun(0, knots, keys)  # which may have moved them off their bounds
+        state = replace(state, trajectory=replace(knots, slack=state.trajectory.slack))
+        state, info = self._iterated(state, 0, 0)
         guessed = Chains(state, info, np.zeros(self.chains, int))
-        better = _improved(found, guessed, self.stage.floor[:1]) & (
-            np.asarray(info.max_violation) == 0.0
-        )
+        inside = np.asarray(info.max_violation) == 0.0
+        better = _improved(found, guessed, self.stage.floor[:1]) & inside
         source = np.arange(self.chains) + self.chains * better
         state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
         return Chains(state, info, np.where(better, 0, found.feasible_since))

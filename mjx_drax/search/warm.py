@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,10 +15,13 @@ from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Multipliers
+from mjx_drax.polish.interior_point import Progress
 from mjx_drax.polish.residual import products
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.search.iterate import joined
+
+Rows = Callable[[Array], Array]
 
 SLACK = 1e-12
 """Least slack, as a share of a range, that a bound or an inequality has at the start."""
@@ -43,24 +47,31 @@ class Warm:
         if horizon == K:
             return self
         stage = np.minimum(np.arange(horizon), K - 1)
+        longer: Warm = jax.vmap(lambda one: one.resampled(lambda a: a[stage]))(self)
+        return longer
 
-        def rows(a: Array) -> Array:
-            return a[:, stage]
+    def resampled(self, rows: Rows, after: Rows | None = None) -> Warm:
+        """One chain at other stages; what belongs to none of them stays.
+
+        Args:
+            rows: makes rows for the new stages of (K, ...), which go with x_k and u_k.
+            after: the same of what goes with x_{k+1}; by default `rows`.
+        """
+        after = rows if after is None else after
 
         def stages(numbers: Stagewise | None) -> Any:
             return None if numbers is None else replace(numbers, stage=rows(numbers.stage))
 
         def knots(z: Trajectory) -> Trajectory:
-            return Trajectory(rows(z.x), rows(z.u), stages(z.slack), z.start)
+            return Trajectory(after(z.x), rows(z.u), stages(z.slack), z.start)
 
-        of_bounds = self.multipliers.bounds
+        multipliers, of_bounds = self.multipliers, self.multipliers.bounds
         return Warm(
             knots(self.knots),
-            replace(
-                self.multipliers,
-                dynamics=rows(self.multipliers.dynamics),
-                constraints=stages(self.multipliers.constraints),
-                bounds=None if of_bounds is None else tuple(map(knots, of_bounds)),  # type: ignore
+            Multipliers(
+                after(multipliers.dynamics),
+                stages(multipliers.constraints),
+                None if of_bounds is None else (knots(of_bounds[0]), knots(of_bounds[1])),
             ),
             rows(self.gains),
         )
@@ -89,21 +100,31 @@ def warmed(own: Any, shared: Any, states: State, warm: Warm) -> State:
 
     def one(own: Any, state: State, warm: Warm) -> State:
         problem = joined(shared, own).problem
-        knots, multipliers = _inside(problem, warm.knots), warm.multipliers
+        knots, multipliers = warm.knots, warm.multipliers
         if multipliers.bounds is None:
             multipliers = replace(multipliers, bounds=state.multipliers.bounds)
         state = replace(state, trajectory=knots, multipliers=multipliers, gains=warm.gains)
-        if not hasattr(state.polish, "barrier"):
-            return state
-        assert multipliers.bounds is not None  # for the type checker
-        parts = jax.tree.leaves(products(problem, knots, multipliers.bounds))
-        count = sum((jnp.sum(part > 0.0) for part in parts), jnp.zeros((), int))
-        total = sum((jnp.sum(part) for part in parts), jnp.zeros(()))
-        rho = jnp.maximum(total / jnp.maximum(count, 1), jnp.finfo(total.dtype).tiny)
-        return replace(state, polish=replace(state.polish, barrier=rho))
+        return resumed(problem, state)
 
     found: State = jax.vmap(one)(own, states, warm)
     return found
+
+
+def resumed(problem: Problem, state: State) -> State:
+    """A chain that goes on from its knots, which keep bounds and inequalities barely.
+
+    The barrier's weight is that of the bounds' multipliers, the mean of multiplier times slack.
+    """
+    knots, v = _inside(problem, state.trajectory), state.multipliers.bounds
+    state = replace(state, trajectory=knots)
+    if not isinstance(state.polish, Progress):
+        return state
+    assert v is not None  # for the type checker
+    parts = jax.tree.leaves(products(problem, knots, v))
+    count = sum((jnp.sum(part > 0.0) for part in parts), jnp.zeros((), int))
+    total = sum((jnp.sum(part) for part in parts), jnp.zeros(()))
+    rho = jnp.maximum(total / jnp.maximum(count, 1), jnp.finfo(total.dtype).tiny)
+    return replace(state, polish=state.polish.again(rho))
 
 
 def _inside(problem: Problem, knots: Trajectory) -> Trajectory:

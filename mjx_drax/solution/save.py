@@ -110,9 +110,10 @@ def extended_data(dynamics: Dynamics) -> dict[str, Any] | None:
     """What a file says of further states; None if there are none."""
     if not isinstance(dynamics, Extended):
         return None
-    names = "free", "shapes", "phases", "order", "starts_known"
+    names = "free", "shapes", "phases", "order"
     numbers = {name: np.asarray(getattr(dynamics, name)).tolist() for name in ("nominal", "u_init")}
-    return {**{name: getattr(dynamics, name) for name in names}, **numbers}
+    known = {"starts_known": bool(dynamics.starts_known)}
+    return {**{name: getattr(dynamics, name) for name in names}, **known, **numbers}
 
 
 def arrays(solution: Results) -> dict[str, np.ndarray]:

@@ -207,6 +207,7 @@ def test_ctrl_c_before_there_is_anything_to_save(monkeypatch, capsys):
     assert capsys.readouterr().err == "mjx-drax: interrupted\n"
 
 
+@pytest.mark.slow
 def test_settings_are_set_by_name(tmp_path, capsys):
     short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video --quiet"
     flags = ["--set", "attempts=1", "--set", "flow.noise=Geometric(3, 0.1)"]
@@ -332,7 +333,7 @@ def test_a_cost_file_has_names_of_its_own(own):
     """Helpers, imports, and what a known name beside it shows to be meant."""
     (own / "mycost.py").write_text(
         COST + "import jax.numpy as guesses\nfrom math import cos as horizons\n"
-        "u_start = x_goal = q_goal = 1.0\nu_bound = 2.0\nu_bounds = (-u_bound, u_bound)\n"
+        "u_first = x_goal = q_goal = 1.0\nu_bound = 2.0\nu_bounds = (-u_bound, u_bound)\n"
         "def terminal(data):\n    return data.qpos\ndef _goall(data):\n    return True\n"
     )
     problem, _ = cost_file.load(str(own / "slider.xml"), str(own / "mycost.py"), None)
@@ -369,6 +370,7 @@ def test_errors_name_cause_and_fix(own, capsys):
     assert "--out" in error_of(capsys, "solve", "pendulum", "--out", str(own / "file"))
 
 
+@pytest.mark.slow
 def test_benchmark_prints_and_saves_rows(tmp_path, capsys):
     main(["benchmark", "pendulum", "--seeds", "0", "--chains", "4", "--out", str(tmp_path)])
     rows = json.loads((tmp_path / "benchmark.json").read_text())

@@ -94,6 +94,7 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
     assert np.median(policy.statistics.max_defects) < 1e-4
 
 
+@pytest.mark.slow
 def test_float64_stays_float64():
     with jax.enable_x64(True):
         policy = MPC(balance(), chains=2, explorers=1, hold=1.0, solver=FAST)
@@ -145,7 +146,7 @@ def test_between_plans_the_feedback_acts_about_the_interpolated_plan(policy):
 
 def test_what_is_not_finite_changes_nothing_and_is_counted(policy, monkeypatch):
     t, shifts, plan = DT, [], mpc._plan
-    monkeypatch.setattr(mpc, "_plan", lambda *a: shifts.append(float(a[5])) or plan(*a))
+    monkeypatch.setattr(mpc, "_plan", lambda *a: shifts.append(float(a[6])) or plan(*a))
     u = policy([np.nan, 0.0], t)
     np.testing.assert_allclose(u, policy.latest.u[1])
     assert policy.statistics.unmeasured == 1
@@ -266,6 +267,7 @@ def test_random_pushes_are_spread_over_time(slider):
     assert {abs(p.force[0]) for p in pushes} == {20.0}  # 2 m/s for 1 kg in 0.1 s
 
 
+@pytest.mark.slow
 def test_trials_in_the_loop_recover_and_are_summed_up(slider):
     policy = MPC(slider, chains=2, explorers=0, hold=1.0, solver=FAST)
     policy.reset(slider.x_init)

@@ -1,11 +1,13 @@
-"""The kernel of the Riccati recursion, interpreted, against the plain recursion of the method."""
+"""The kernels of the Riccati recursion, interpreted, against the plain recursion of the method."""
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax.kernels import riccati_gpu
+from mjx_drax.kernels import riccati_blocks, riccati_gpu
 from mjx_drax.kernels.riccati_gpu import MAX_NDX, THREADS, newton_steps
 from mjx_drax.method.model import Linearization, QuadraticCost
 from mjx_drax.method.riccati import White, newton
@@ -51,6 +53,35 @@ def test_it_agrees_with_the_plain_recursion(noisy):
         agree(newton_steps(*jax.tree.leaves(arguments), interpret=True), plain, 1e-9)
 
 
+@pytest.mark.parametrize(("noisy", "penalty"), [(True, None), (False, None), (False, np.inf)])
+def test_blocks_agree_with_the_plain_recursion(noisy, penalty):
+    with jax.enable_x64(True):
+        arguments = batch(2, np.float64, noisy, ndx=17)  # a tile of 32
+        if penalty:  # as the polish asks for
+            arguments = (*arguments[:3], jnp.full(2, penalty), arguments[-1])
+        plain = jax.jit(jax.vmap(newton))(*arguments)
+        seen = riccati_blocks.newton_steps(*jax.tree.leaves(arguments), interpret=True)
+        agree(seen, plain, 1e-9)
+
+
+def test_blocks_that_are_not_positive_definite_are_not_numbers():
+    """The polish sees from it that the model needs more damping."""
+    linear, cost, *rest = batch(2, np.float32, noisy=False)
+    cost = replace(cost, Huu=cost.Huu.at[1].add(-1e4 * jnp.eye(NU)))
+    arrays = jax.tree.leaves((linear, cost, *rest))
+    seen = riccati_blocks.newton_steps(*arrays, interpret=True)
+    assert [bool(jnp.isfinite(dx).all()) for dx in seen["dx"]] == [True, False]
+
+
+def test_a_kernel_is_chosen_by_the_size_of_blocks():
+    def kernel(ndx, nu, dtype=np.float32):
+        return riccati_gpu.kernel_for(np.zeros((ndx, ndx), dtype), np.zeros((ndx, nu), dtype))
+
+    assert kernel(6, 4) is kernel(6, 4, np.float64) is newton_steps
+    assert kernel(7, 4) is kernel(64, 32) is riccati_blocks.newton_steps
+    assert kernel(7, 4, np.float64) is kernel(65, 4) is kernel(8, 0) is None
+
+
 @pytest.mark.parametrize(("noisy", "ndx"), [(True, NDX), (False, NDX), (False, MAX_NDX + 1)])
 def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeypatch):
     """As on a GPU, but interpreted: chains within problems are one launch."""
@@ -80,8 +111,9 @@ def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeyp
     JAX >= (0, 11),
     reason="since jax 0.11, Triton kernels are lowered only where there is a GPU",
 )
+@pytest.mark.parametrize("steps", [newton_steps, riccati_blocks.newton_steps])
 @pytest.mark.parametrize("noisy", [True, False])
-def test_it_lowers_for_cuda_without_a_gpu(noisy):
+def test_it_lowers_for_cuda_without_a_gpu(noisy, steps):
     arrays = jax.tree.leaves(batch(4, np.float32, noisy))
-    text = jax.jit(newton_steps).trace(*arrays).lower(lowering_platforms=("cuda",)).as_text()
+    text = jax.jit(steps).trace(*arrays).lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("triton") >= 2

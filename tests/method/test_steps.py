@@ -42,6 +42,7 @@ def assert_gaussian(x, covariance):
 BOLTZMANN = SIGMA**2 * np.linalg.inv(Q)  # exp(-c / sigma^2)
 
 
+@pytest.mark.slow
 def test_small_steps_sample_the_boltzmann_density():
     solver = replace(NOISY, preconditioner=Identity(), step_size=0.03)
     assert_gaussian(sampled(solver, 700), BOLTZMANN)

@@ -78,6 +78,7 @@ def test_circles_and_capsules_against_closed_forms():
         close(SHAPES[name](p), least - radius, 1e-5)
 
 
+@pytest.mark.slow
 def test_boxes_and_polygons_against_their_sampled_edges():
     turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
     corners = np.array([0.3, 0.2]) + [[-0.8, -0.4], [0.8, -0.4], [0.8, 0.4], [-0.8, 0.4]] @ turn.T
@@ -274,6 +275,7 @@ def test_numbers_may_be_traced():
     close(gaps(jnp.array([1.0, 0.5, np.pi / 2])), [2**0.5 - 0.25, 1.1, 1.0])
 
 
+@pytest.mark.slow
 def test_a_plan_around_obstacles_is_certified():
     listed, problem = planar()
     solution = solve(problem, chains=8, seed=0)

@@ -35,8 +35,13 @@ def polished(problem, knots, polish, stop=None, cost=1.0):
 CASES = {"van_der_pol": 14, "crane": 30, "hanging_chain": 24, "hs071": 18, "hs078": 16}
 
 
+QUICK = ("hs071", "hs078")
+
+
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(n, marks=pytest.mark.slow) for n in CASES if n not in QUICK)]
+)
 def test_one_guess_is_enough_in_float64(name):
     iterations, residual, cost, status = suite.ours(*suite.posed(name))
     assert status == "optimal"
@@ -47,7 +52,7 @@ def test_one_guess_is_enough_in_float64(name):
         assert cost == pytest.approx(known[name], rel=1e-4)
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "hs071"])
+@pytest.mark.parametrize("name", [pytest.param("van_der_pol", marks=pytest.mark.slow), "hs071"])
 def test_float32_reaches_its_tolerance(name):
     state, info = polished(*suite.posed(name), Polish(1e-4, 60))
     assert state.trajectory.u.dtype == jnp.float32
@@ -97,7 +102,7 @@ def test_a_chain_stays_inside_with_positive_forces_up_to_an_optimum_on_its_bound
 
 
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("factor", [1e-6, 1e6])
+@pytest.mark.parametrize("factor", [1e-6, pytest.param(1e6, marks=pytest.mark.slow)])
 def test_the_path_does_not_depend_on_the_units_of_the_cost(factor):
     root = np.sqrt(factor)
     other = swing(
@@ -130,6 +135,7 @@ def test_what_cannot_be_done_is_never_called_optimal(impossible):
     assert info.max_defect > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_a_chain_that_finds_no_step_has_stalled_and_leaves_its_place():
     """At a kink there is no smaller cost, and no slope that is 0; far from a goal out of reach."""
@@ -146,6 +152,7 @@ def test_a_chain_that_finds_no_step_has_stalled_and_leaves_its_place():
             assert state.trajectory.u[0, 0] == pytest.approx(0.3, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_without_enough_iterations_a_chain_is_neither_optimal_nor_stalled():
     problem, knots = suite.posed("crane")

@@ -10,7 +10,6 @@ import pytest
 from builders import DT, K, arm, double_integrator, matrices, robot
 
 from mjx_drax import (
-    MPC,
     Constant,
     DraxError,
     Identity,
@@ -265,6 +264,33 @@ def test_the_papers_own_flow_finds_a_start():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("window", [(0.3, 1.0), (0.9, 1.2)])
+def test_a_waypoint_is_passed_at_the_best_time_within_a_window(window):
+    """Back to -0.1 m, then to 1 m at rest after 2 s, with least effort."""
+    found = solve(
+        fastest(
+            horizon=[window, (0.5, 3.0)],
+            knots=[20, 20],
+            running_cost=lambda x, u, knot: knot.dt * u[0] ** 2,
+            equality=lambda x, u, knot: jnp.where(knot.index == 20, x[:1] + 0.1, 0.0),
+            terminal_equality=lambda x, knot: jnp.stack([x[0] - 1.0, x[1], knot.time - 2.0]),
+            u_bounds=(-20.0, 20.0),
+        ),
+        chains=4,
+    )
+
+    def effort(distance, v_0, v_1, T):  # of the cubic from end to end
+        return 12 * (distance - 0.5 * (v_0 + v_1) * T) ** 2 / T**3 + (v_1 - v_0) ** 2 / T
+
+    t, v = np.meshgrid(np.linspace(*window, 301), np.linspace(-1, 1, 801))
+    efforts = effort(-0.1, 0.0, v, t) + effort(1.1, v, 0.0, 2.0 - t)
+    best = efforts.argmin()
+    assert found.certified
+    assert found.cost.min() == pytest.approx(efforts.min(), rel=4e-3)
+    assert found.times[20] == pytest.approx(t.ravel()[best], abs=5e-3)
+
+
+@pytest.mark.slow
 def test_a_changed_model_is_saved_loaded_filmed_and_exported(tmp_path):
     problem = robot(
         horizon=(0.05, 0.4),
@@ -397,9 +423,19 @@ def test_windows_may_lie_within_the_longest_durations():
         fastest(inequality=between(lambda x, u: u - 1.0, 6.0, 7.0))
 
 
-def test_policies_refuse_what_is_open():
-    with pytest.raises(DraxError, match="MPC starts where the robot is"):
-        MPC(fastest())
+def test_a_free_duration_and_rates_are_counted_from_where_x_0_is():
+    problem = fastest(rates=1, u_init=None)
+    knots, later = problem.draw(jax.random.key(0)), problem.at_time(3.0)
+
+    def seen(problem):
+        x, u, at = problem.stages(knots)
+        return jax.vmap(lambda x, u, knot: problem.dynamics.at(knot).here(x, u))(x, u, at)
+
+    now, then = seen(problem), seen(later)
+    np.testing.assert_allclose(then.time - 3.0, now.time, atol=1e-5)
+    np.testing.assert_array_equal(then.dt, now.dt)
+    np.testing.assert_array_equal(then.rate, now.rate)
+    assert now.rate[0] == 0.0 != now.rate[1]
 
 
 def test_draws_agree_with_what_is_chosen():

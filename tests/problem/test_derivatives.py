@@ -158,6 +158,7 @@ SOLVER = Langevin(
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_pendulum_is_solved_from_function_values_alone():
     problem = from_function(
         pendulum,

@@ -198,6 +198,7 @@ KINKED = Restarts(replace(Restarts().flow, tail=40), descent=60, attempts=1)
 STOPS = [(0, Killed), (1, KeyboardInterrupt), (1, Killed), (2, KeyboardInterrupt), (1, Killed)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("often")
 def test_killed_between_rollouts(tmp_path):
     given = {"problem": bouncing(Stopped), "solver": KINKED}
@@ -214,6 +215,7 @@ def test_killed_between_rollouts(tmp_path):
     assert_same(solved(checkpoint=file, **given), whole)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("often")
 def test_a_batch_that_is_killed_between_rollouts(tmp_path):
     ball, starts = bouncing(Stopped), np.array([[1.0, 0.0], [0.8, 0.5], [1.1, 0.0]], np.float32)
@@ -387,6 +389,7 @@ def full(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nothing_iterates")
 @pytest.mark.parametrize("call", [solved, batch])
 def test_what_cannot_be_written_is_refused_before_the_solve(call, tmp_path, monkeypatch):

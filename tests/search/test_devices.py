@@ -81,14 +81,8 @@ assert overlap(False) == count and overlap(True) == 1
 """
 
 
-@pytest.mark.parametrize(
-    ("count", "what"),
-    [
-        (2, "solve"),
-        pytest.param(2, "all", marks=pytest.mark.slow),
-        pytest.param(8, "all", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "what"), [(2, "solve"), (2, "all"), (8, "all")])
 def test_several_devices_give_the_answers_of_one(count, what, tmp_path):
     flags = f"--xla_force_host_platform_device_count={count}"
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}

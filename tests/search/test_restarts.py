@@ -96,7 +96,8 @@ def test_chains_that_are_done_are_left_alone():
     assert (second.cost < first.cost).any()
 
 
-@pytest.mark.parametrize("weight", [1e-3, pytest.param(1e4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("weight", [1e-3, 1e4])
 def test_no_setting_depends_on_the_units_of_the_cost(weight):
     solver = Restarts(SHORT, attempts=1)
     usual, other = (solve(swing(w), chains=4, solver=solver) for w in (1.0, weight))
@@ -262,6 +263,7 @@ def with_start(ball, x):
     return replace(ball, x_init=x)
 
 
+@pytest.mark.slow
 def test_rollouts_follow_in_a_batch_too(balls):
     (_, without), (starts, found) = two_balls(balls[1], NO_ROLLOUTS), two_balls(balls[1])
     assert not (without.chain_defect < 1e-3).any()
@@ -293,6 +295,7 @@ def test_interrupted_between_rollouts_keeps_what_there_is(balls):
 TINY = replace(Restarts().flow, iterations=4, tail=4)
 
 
+@pytest.mark.slow
 def test_settings_that_depend_on_the_problem(balls):
     smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
     assert (smooth.within, smooth.enough, smooth.heated) == (0.1, 0.95, True)

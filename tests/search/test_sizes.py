@@ -85,6 +85,7 @@ def test_costs_that_are_no_numbers_do_not_count():
     assert scale_and_floor(Sizes(*[nothing] * 5), True) == (1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_the_flow_takes_the_same_step_in_any_units():
     found = []
     for unit in (np.ones(2), UNIT):

@@ -38,6 +38,7 @@ def test_the_answer_itself_stays(cold):
     np.testing.assert_allclose(again.cost, cold.cost, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_another_target_takes_few_iterations(cold):
     other = solve(limited(1.05), chains=4)
     warm = solve(limited(1.05), chains=4, guess=cold)

@@ -63,7 +63,8 @@ def test_every_problem_is_solved_from_its_own_start(whole):
     np.testing.assert_allclose(mirrored.u, -whole.u, atol=2e-3)
 
 
-@pytest.mark.parametrize("near", [1e-4, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("near", [1e-4, 0.0])
 def test_answers_do_not_depend_on_how_the_batch_is_split(whole, near):
     """Bit for bit as users compile, which the slow tests do; nearly as the default tests do."""
     split = solve_batch(from_start, STARTS, chains=3, solver=SOLVER, chunk=3)
@@ -108,6 +109,7 @@ def test_finished_problems_leave_the_batch():
     assert done == [(3, 5), (5, 5)]
 
 
+@pytest.mark.slow
 def test_only_problems_that_are_not_done_are_tried_again():
     walls = replace(BASE.bounds, x_lower=jnp.array([-1.0, -10.0]), x_upper=jnp.array([1.0, 10.0]))
     starts = np.array([[0.0, 0.0], [0.9, 9.0], [0.1, 0.0]])  # the second one hits the wall

@@ -47,6 +47,7 @@ def test_programs_have_a_log_too():
     np.testing.assert_array_equal(found.history["residual"][-1], found.residual)
 
 
+@pytest.mark.slow
 def test_chains_that_stall_are_told_from_chains_that_run_out_of_iterations(tmp_path):
     once = Restarts(descent=20, attempts=1)
     kink = from_program(2, cost=lambda z: jnp.abs(z[0] - 0.3) + z[1] ** 2)

@@ -105,6 +105,7 @@ def test_it_is_saved_and_loaded_in_float64(problem, solution, tmp_path):
     save_csv(loaded, tmp_path / "replay.csv")
 
 
+@pytest.mark.slow
 def test_a_guess_and_another_attempt_stay_in_float64(problem):
     guess = Trajectory(np.zeros((10, 2)), np.zeros((10, 1)))
     eager = Restarts(descent=20, attempts=2, enough=2.0)
@@ -128,6 +129,8 @@ def test_a_model_reaches_1e_8(rail, tmp_path):
         np.testing.assert_array_equal(loaded.replayed[0], solution.replayed[0])
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_batches_reach_1e_8(problem):
     starts = np.array([[0.0, 0.0], [0.1, 0.0]])
     batch = solve_batch(
@@ -146,6 +149,7 @@ def test_programs_reach_1e_8():
     np.testing.assert_allclose(found.x, 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_command_makes_the_problem_in_float64(tmp_path, capsys):
     words = "solve pendulum --horizon 1 --chains 2 --iterations 4 --no-video --quiet"
     main([*words.split(), "--precision", "64", "--residual", "1e-7", "--out", str(tmp_path)])

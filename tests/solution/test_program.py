@@ -166,6 +166,7 @@ def _slopes_at(x):
     return [np.ravel(jax.jacobian(parts[name])(jnp.asarray(x))) for name in names]
 
 
+@pytest.mark.slow
 def test_the_polish_goes_to_the_tolerance_of_the_precision_or_to_the_one_given():
     """hs071 to all digits of the book; what is optimal is judged by the same tolerance."""
     program = from_program(4, **hs071(), bounds=(1.0, 5.0))

@@ -94,6 +94,7 @@ def test_a_minimum_is_shown_with_its_cost_and_what_it_breaks():
     assert "infeasible" in off._repr_html_()
 
 
+@pytest.mark.slow
 def test_a_batch_is_shown_by_its_counts_and_by_what_failed():
     problem = point()
     starts = jnp.array([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]])

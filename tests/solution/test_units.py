@@ -152,7 +152,7 @@ PROBLEMS = {
     },
     "cartpole_swingup": {"task": cartpole_swingup.make, "chains": 16},
 }
-QUICK = ("line", "pendulum")
+QUICK = ("line",)
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name not in QUICK]
 ALL = [*QUICK, *SLOW]
 SAME = {"cost x 1e-6": {"weight": 1e-6}, "cost x 1e6": {"weight": 1e6}}

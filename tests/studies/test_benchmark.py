@@ -209,6 +209,7 @@ def test_random_states_are_the_same_however_many():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_command_writes_a_list_of_rows(tmp_path, capsys, monkeypatch):
     fewer = {"no restarts": Restarts(attempts=1)}
     monkeypatch.setattr(benchmark, "ablations", lambda problem, solver: fewer)

@@ -114,13 +114,16 @@ def reached(solver, name):
     return solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "text", "cls", "fields"),
     [
         ("flow.preconditioner", "Stiff", "Stiff", {"control": 10.0}),
         ("flow.preconditioner", "Stiff(control=5.0)", "Stiff", {"control": 5.0}),
         ("flow.preconditioner", "Following()", "Following", {"control": 10.0}),
-        ("flow.bounds", "Approach(0.9)", "Approach", {"share": 0.9}),
+        pytest.param(
+            "flow.bounds", "Approach(0.9)", "Approach", {"share": 0.9}, marks=pytest.mark.slow
+        ),
         ("flow.noise", "Cosine(0.1, 0.01)", "Cosine", {"start": 0.1, "end": 0.01}),
     ],
 )
@@ -361,6 +364,7 @@ def test_mpc_takes_own_dynamics_metric_bounds_and_schedule(swung, mine):
         x = np.asarray(dynamics.step(jnp.asarray(x), jnp.asarray(u, jnp.float32)))
 
 
+@pytest.mark.slow
 def test_mpc_turns_through_the_jump(swung):
     policy = MPC(swung.problem, chains=4, iterations=4, solver=Langevin(iterations=5, tail=40))
     x, dynamics = np.asarray(swung.problem.x_init), swung.problem.dynamics

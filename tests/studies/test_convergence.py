@@ -187,7 +187,7 @@ def opened():
 
 
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("make", [short, opened])
+@pytest.mark.parametrize("make", [short, pytest.param(opened, marks=pytest.mark.slow)])
 def test_ipopt_gets_the_derivatives_of_the_whole_program(make):
     """Blocks put in their places against the derivatives of the whole in one piece."""
     program = ipopt_jax.Program(make())
@@ -287,6 +287,7 @@ def test_ratio_is_of_iterations(monkeypatch):
     assert (row["numbers"], row["optimum"]) == (2, 0.0)
 
 
+@pytest.mark.slow
 def test_the_suite_runs_in_float64_and_writes_its_rows(tmp_path, capsys):
     assert main(["benchmark", "hs028", "--suite", "convergence", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out

@@ -1,0 +1,222 @@
+"""The Riccati recursion of `method.riccati` as two GPU kernels: a block of threads for each chain.
+
+For blocks too large for the registers of one thread (`riccati_gpu`). Matrices are tiles of the
+next powers of two, so that the block multiplies and adds whole tiles. Where the method factorizes,
+the kernel inverts S / mu and Quu, by sweeps: a sweep of k does for all i, j not k
+
+    T_ij <- T_ij - T_ik T_kj / T_kk     T_ik <- T_ik / T_kk     T_kk <- -1 / T_kk
+
+and after all of them T holds -T^{-1}. It stays symmetric, and needs one column at a time. The
+pivots T_kk are positive if and only if T is positive definite; else the result is not a number.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mjx_drax.kernels.linalg import cholesky, solve_upper
+
+LEAST, MAX_NDX, MAX_NU = 16, 64, 32
+"""The least tile of tensor cores, and the largest blocks: beyond, registers do not hold them."""
+
+WARPS = 4
+"""Warps of 32 threads that work on a chain: more of them wait for each other longer."""
+
+SPLIT = lax.DotAlgorithmPreset.TF32_TF32_F32_X3
+"""Products on tensor cores, of factors in two parts: as exact as float32, and fewer registers."""
+
+
+def newton_steps(
+    A: Array,
+    B: Array,
+    h: Array,
+    gx: Array,
+    gu: Array,
+    Hxx: Array,
+    Hux: Array,
+    Huu: Array,
+    multipliers: Array,
+    penalty: Array,
+    xi_u: Array | None = None,
+    xi_e: Array | None = None,
+    interpret: bool = False,
+) -> dict[str, Array | None]:
+    """Newton step, noise and feedback of many chains, as `riccati_gpu.newton_steps` returns them.
+
+    The plain twin is `method.riccati.newton`.
+    """
+    chains, K, n, m = B.shape
+    N, M = tile(n), tile(m)
+    soft = (1.0 / penalty)[:, None]
+    A, Hxx = (padded(a, N, N) for a in (A, Hxx))
+    B, Hux, Huu = padded(B, N, M), padded(Hux, M, N), padded(Huu, M, M)
+    h, gx, multipliers = (padded(a, N) for a in (h, gx, multipliers))
+
+    def launch(body: Any, shapes: dict[str, tuple[int, ...]], *arrays: Array) -> dict[str, Array]:
+        return _launch(body, {k: (chains, K, *s) for k, s in shapes.items()}, arrays, interpret)
+
+    exact = partial(product, precision=lax.Precision.HIGHEST if interpret else SPLIT)
+    shapes = {"K": (M, N), "kff": (M,), "Q": (M, M), "T": (N, N), "P": (N, N), "p": (N,)}
+    given = soft, A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu
+    left = launch(partial(backward, K, n, m, exact), shapes, *given)
+    factors = [left[name] for name in ("K", "kff", "T", "P", "p")]
+    shapes = {"dx": (N,), "du": (M,), "rate": (N,)}
+    white = []
+    if xi_u is not None and xi_e is not None:
+
+        def colored(soft: Array, Q: Array, P: Array, xi_u: Array, xi_e: Array) -> tuple[Any, Any]:
+            Ls = cholesky(jnp.eye(n, dtype=P.dtype) + soft * P[:n, :n])
+            kicks = jnp.sqrt(soft) * solve_upper(Ls, xi_e)
+            return solve_upper(cholesky(Q[:m, :m]), xi_u), kicks
+
+        over_stages = jax.vmap(colored, in_axes=(None, 0, 0, 0, 0))
+        of_u, of_x = jax.vmap(over_stages)(soft[:, 0], left["Q"], left["P"], xi_u, xi_e)
+        white = [padded(of_u, M), padded(of_x, N)]
+        shapes |= {"nx": (N,), "nu": (M,)}
+    step = launch(partial(forward, K), shapes, soft, A, B, h, multipliers, *factors, *white)
+    sizes = {"du": m, "nu": m}
+    found = {name: a[..., : sizes.get(name, n)] for name, a in step.items()}
+    return {"nx": None, "nu": None, **found, "K": left["K"][..., :m, :n]}
+
+
+def backward(horizon: int, n: int, m: int, product: Any, *refs: Any) -> None:
+    """`method.riccati.factorize` of one chain, with inverses for factors."""
+    soft, A, B, h, multipliers, gx, gu, Hxx, Hux, Huu = refs[:10]
+    gains, offsets, of_u, inverses, values, slopes = refs[10:]
+    s = soft[0, 0]
+
+    def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        P, p = carry
+        k = horizon - 1 - i
+        a, b = A[0, k], B[0, k]
+        T = diagonal(P.shape[0], P.dtype) + s * P
+        T = lax.cond(s == 0.0, lambda T: T, lambda T: -swept(T, n), T)
+        relaxed = symmetric(product(T, P))
+        slope = times(relaxed, h[0, k]) + times(T, p + s * times(P, multipliers[0, k]))
+        PA, PB = product(relaxed, a), product(relaxed, b)
+        Qux, Quu = Hux[0, k] + product(b.T, PA), Huu[0, k] + product(b.T, PB)
+        qu = gu[0, k] + transposed_times(b, slope)
+        inverse = -swept(Quu, m)
+        K, kff = -product(inverse, Qux), -times(inverse, qu)
+        K = K - product(inverse, Qux + product(Quu, K))  # one refinement
+        gains[0, k], offsets[0, k], of_u[0, k] = K, kff, Quu
+        inverses[0, k], values[0, k], slopes[0, k] = T, P, p
+        before = Hxx[0, k] + product(a.T, PA) + product(Qux.T, K)
+        return symmetric(before), gx[0, k] + transposed_times(a, slope) + transposed_times(Qux, kff)
+
+    lax.fori_loop(0, horizon, stage, (Hxx[0, horizon], gx[0, horizon]))
+
+
+def forward(horizon: int, *refs: Any) -> None:
+    """`method.riccati.solve_and_sample` of one chain; noise comes colored."""
+    soft, A, B, h, multipliers, gains, offsets, inverses, values, slopes, *rest = refs
+    s = soft[0, 0]
+    noisy = len(rest) > 3
+    white, (dx, du, rate, *noise) = (rest[:2], rest[2:]) if noisy else ([], rest)
+
+    def stage(k: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        a, b, K, T, p, multiplier = (
+            ref[0, k] for ref in (A, B, gains, inverses, slopes, multipliers)
+        )
+        x = carry[0]
+        u = times(K, x) + offsets[0, k]
+        x = times(T, h[0, k] + times(a, x) + times(b, u) + s * (multiplier - p))
+        dx[0, k], du[0, k] = x, u
+        rate[0, k] = times(values[0, k], x) + p - multiplier
+        if not noisy:
+            return (x,)
+        u = times(K, carry[1]) + white[0][0, k]
+        nx = times(T, times(a, carry[1]) + times(b, u)) - white[1][0, k]
+        noise[0][0, k], noise[1][0, k] = nx, u
+        return x, nx
+
+    zero = jnp.zeros_like(h[0, 0])
+    lax.fori_loop(0, horizon, stage, (zero, zero) if noisy else (zero,))
+
+
+def swept(T: Array, count: int) -> Array:
+    """T after sweeps of its first `count` rows; see above."""
+    rows, columns = indices(T.shape[0])
+
+    def sweep(k: Array, T: Array) -> Array:
+        of_column = columns == k
+        column = jnp.sum(jnp.where(of_column, T, 0.0), axis=1)
+        pivot = jnp.sum(jnp.where(jnp.arange(T.shape[0]) == k, column, 0.0))
+        scaled = column / jnp.where(pivot > 0.0, pivot, jnp.nan)
+        inner = T - column[:, None] * scaled[None, :]
+        border = jnp.where(of_column, scaled[:, None], scaled[None, :])
+        there = of_column | (rows == k)
+        corner = of_column & (rows == k)
+        return jnp.where(corner, -1.0 / pivot, jnp.where(there, border, inner))
+
+    return lax.fori_loop(0, count, sweep, T)
+
+
+def indices(n: int) -> tuple[Array, Array]:
+    """The row and the column of every entry of a tile (n, n)."""
+    return lax.broadcasted_iota(jnp.int32, (n, n), 0), lax.broadcasted_iota(jnp.int32, (n, n), 1)
+
+
+def diagonal(n: int, dtype: Any) -> Array:
+    """The identity."""
+    rows, columns = indices(n)
+    return jnp.where(rows == columns, jnp.ones((), dtype), jnp.zeros((), dtype))
+
+
+def product(A: Array, B: Array, precision: Any) -> Array:
+    """A B."""
+    return jnp.dot(A, B, precision=precision)
+
+
+def times(A: Array, v: Array) -> Array:
+    """A v."""
+    return jnp.sum(A * v[None, :], axis=1)
+
+
+def transposed_times(A: Array, v: Array) -> Array:
+    """A'v."""
+    return jnp.sum(A * v[:, None], axis=0)
+
+
+def symmetric(A: Array) -> Array:
+    """1/2 (A + A')."""
+    return 0.5 * (A + A.T)
+
+
+def tile(n: int) -> int:
+    """The size of the tile for blocks of n rows."""
+    return max(LEAST, 1 << (n - 1).bit_length())
+
+
+def padded(a: Array, *sizes: int) -> Array:
+    """Blocks (..., *shape) with zeros around, up to `sizes`."""
+    lead = a.ndim - len(sizes)
+    more = [size - there for size, there in zip(sizes, a.shape[lead:], strict=True)]
+    return jnp.pad(a, [(0, 0)] * lead + [(0, by) for by in more])
+
+
+def _launch(
+    body: Any, shapes: dict[str, tuple[int, ...]], arrays: tuple[Array, ...], interpret: bool
+) -> dict[str, Array]:
+    """What the body writes, by name; the first axis of all arrays is that of chains."""
+    from jax.experimental import pallas as pl  # only here: it takes a second
+    from jax.experimental.pallas.triton import CompilerParams
+
+    def of_chain(shape: tuple[int, ...]) -> pl.BlockSpec:
+        return pl.BlockSpec((1, *shape[1:]), lambda i: (i, *[0] * (len(shape) - 1)))
+
+    out = pl.pallas_call(
+        body,
+        grid=(arrays[0].shape[0],),
+        in_specs=[of_chain(a.shape) for a in arrays],
+        out_specs=[of_chain(s) for s in shapes.values()],
+        out_shape=[jax.ShapeDtypeStruct(s, arrays[1].dtype) for s in shapes.values()],
+        compiler_params=CompilerParams(num_warps=WARPS, num_stages=1),
+        interpret=interpret,
+    )(*arrays)
+    return dict(zip(shapes, out, strict=True))
