@@ -118,8 +118,8 @@ def render_diffusion(
     moments = _moments(shown[0], seconds, fps)
     told = [_caption(solution, shown[0], at) if caption else [] for at in moments]
     lines = lines if caption else []
-    text = caption_height([*told, lines], height, width)
     below = 2 * round(_STRIP * height / 2)
+    text = caption_height([*told, lines], height - below, width)
     states = finite(solution.replayed[0])
     times = problem.times[: len(states)]
     film = Film(

@@ -32,7 +32,7 @@ FULL = {"chains": 256}
 FIRST_ORDER = "gradient descent", "quasi-Newton", "paper's flow"
 
 STYLES: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("infeasible: breaks the dynamics", {"color": "0.45", "lw": 0.6, "ls": ":"}),
+    ("infeasible: breaks the dynamics", {"color": "0.3", "lw": 1.0, "ls": ":"}),
     ("feasible, does not reach the goal", {"color": VERMILLION, "lw": 1.2}),
     ("feasible, reaches the goal", {"color": BLUE, "lw": 1.2}),
 )
@@ -61,7 +61,7 @@ def make(
         tell(f"bug-trap: {name}, {settings.budget_of(solver):,} iterations")
         solutions[name] = solve(problem, chains, solver=solver, guess=start, progress=False)
     rows = {name: solve_row(name, solution) for name, solution in solutions.items()}
-    figure = new_figure(10.2, 4.2)
+    figure = new_figure(10.2, 5.0)
     drawn = [f"{name}, {longer}×" for name in FIRST_ORDER]
     for i, name in enumerate(drawn):
         axes = figure.add_subplot(1, len(drawn), i + 1)
@@ -72,6 +72,7 @@ def make(
         if i == 0:
             for label, style in STYLES:
                 axes.plot([], [], label=label, **style)
+            axes.plot([], [], color=BLACK, lw=2.2, label="the best")
             axes.set_ylabel("y [m]", fontsize=8)
             figure.legend(loc="outside lower center", ncols=len(STYLES) + 2, fontsize=8)
     figure.suptitle(
@@ -111,7 +112,7 @@ def _draw_paths(axes: Axes, solution: Solution) -> None:
             axes.plot(path[:, 0], path[:, 1], **style)
     best = paths[solution.best_chain]
     if feasible.any():
-        axes.plot(best[:, 0], best[:, 1], color=BLACK, lw=2.2, zorder=4, label="the best")
+        axes.plot(best[:, 0], best[:, 1], color=BLACK, lw=2.2, zorder=4)
     axes.plot(*paths[0, 0, :2], "s", ms=6, color=BLACK, mec="white", zorder=5)
     axes.plot(*task.GOAL, "*", ms=15, color=GREEN, mec="white", zorder=5, label="goal")
     axes.set(xlim=(-3, 3), ylim=(-3, 3), aspect="equal")
