@@ -69,8 +69,8 @@ class Scene:
                 return
             geom = self.content.geoms[self.content.ngeom]
             mujoco.mjv_initGeom(geom, kind, zero, zero, turn, np.float32(_RED))
-            width = 0.06 * float(np.linalg.norm(vector))
-            mujoco.mjv_connector(geom, kind, width, start, start + vector)
+            width = 0.08 * float(np.linalg.norm(vector))
+            mujoco.mjv_connector(geom, kind, width, start, start + 2.0 * vector)  # draws half of it
             self.content.ngeom += 1
 
     def add_robot(self, qpos: Floats, opacity: float, color: npt.ArrayLike | None = None) -> None:

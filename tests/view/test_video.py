@@ -340,7 +340,8 @@ def test_overlay_is_drawn_and_tells_the_time(backend: str) -> None:
     below = caption_height([told], *plain.shape[1:3])
     assert 20 < below < 60
     assert np.any(lines[0, -below:] != lines[1, -below:])
-    np.testing.assert_array_equal(lines[0, :-below], lines[1, :-below])  # the picture is free of it
+    pictures = lines[:2, :-below].astype(int)  # free of the text; renderers round differently
+    np.testing.assert_allclose(pictures[0], pictures[1], atol=2)
     np.testing.assert_array_equal(plain[0], plain[1])
 
 
