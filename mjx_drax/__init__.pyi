@@ -54,3 +54,4 @@ from .view.browser import save_html as save_html
 from .view.diffusion import render_diffusion as render_diffusion
 from .view.timelapse import render_timelapse as render_timelapse
 from .view.video import render as render
+from .view.video import render_comparison as render_comparison

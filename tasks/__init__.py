@@ -8,6 +8,7 @@ matplotlib axes where there is no model to render. All are solved with the defau
 from __future__ import annotations
 
 import ast
+import difflib
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -26,8 +27,8 @@ def summary(name: str) -> str:
     return (ast.get_docstring(ast.parse(source)) or "").split("\n")[0]
 
 
-def load(name: str) -> ModuleType:
-    """The module of a task, by its name or by a beginning that no other task has.
+def full_name(name: str) -> str:
+    """The name of a task, of which the beginning is enough if no other task has it.
 
     Raises:
         DraxError: there is no such task; lists those there are.
@@ -37,5 +38,16 @@ def load(name: str) -> ModuleType:
         matching = [name]
     if len(matching) != 1:
         what = f"several tasks begin with {name!r}" if matching else f"there is no task {name!r}"
-        raise DraxError(f"{what}: choose one of {', '.join(matching or names())}.")
-    return import_module(f"{__name__}.{matching[0]}")
+        near = [] if matching else difflib.get_close_matches(str(name), names(), 1)
+        choice = f"{near[0]}, or another of" if near else "one of"
+        raise DraxError(f"{what}: choose {choice} {', '.join(matching or names())}.")
+    return matching[0]
+
+
+def load(name: str) -> ModuleType:
+    """The module of a task, by its name or by a beginning that no other task has.
+
+    Raises:
+        DraxError: there is no such task; lists those there are.
+    """
+    return import_module(f"{__name__}.{full_name(name)}")

@@ -43,6 +43,8 @@ def make(horizon: float = 11.9, wall: np.ndarray = WALL, name: str = "bug_trap")
         u_bounds=(-1.0, 1.0),
         x_scatter=([-3.0, -3.0, -np.pi], [3.0, 3.0, np.pi]),
         goal=lambda x: np.linalg.norm(x[:2] - GOAL) < 0.3,
+        x_names=("x [m]", "y [m]", "heading [rad]"),
+        u_names=("speed [m/s]", "turn rate [rad/s]"),
         name=name,
     )
 

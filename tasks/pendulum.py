@@ -30,6 +30,8 @@ def make(horizon: float = 4.9) -> Problem:
         u_bounds=(-1.0, 1.0),
         x_scatter=(-6.0, 6.0),
         goal=lambda x: abs(x[0]) < 0.1 and abs(x[1]) < 0.5,
+        x_names=("angle [rad]", "velocity [rad/s]"),
+        u_names=("torque [N m]",),
         name="pendulum",
     )
 

@@ -28,8 +28,12 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit status is 0 if it did what was asked for, 1 or 2 if not."""
+    parser = _parser()
     try:
-        options = _parser().parse_args(arguments)
+        options = parser.parse_args(arguments)
+        if options.run is None:  # no command
+            parser.print_help()
+            return 0
         status: int = options.run(options)
         sys.stdout.flush()
         return status
@@ -47,9 +51,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mjx-drax",
-        description="Trajectories for MuJoCo models by equality-constrained diffusion.",
+        description="Finds motions for MuJoCo models: give a model and a cost, get a trajectory "
+        "that MuJoCo can replay, and a video of it.",
+        epilog="First try: mjx-drax solve cartpole. Help on a command: mjx-drax COMMAND --help.",
     )
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    parser.set_defaults(run=None)
+    commands = parser.add_subparsers(metavar="COMMAND")
     for name, command in COMMANDS.items():
         words = command.__doc__ or ""
         child = commands.add_parser(

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 
+from mjx_drax import tasks
 from mjx_drax.cli.common import at_least_1, say
 
 
@@ -34,6 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print each row as it is ready, and save them all."""
+    if options.suite is None:
+        for name in options.tasks:
+            tasks.full_name(name)  # answers at once, before heavy imports
     from mjx_drax.solution.save import writable
     from mjx_drax.studies import benchmark
     from mjx_drax.studies.convergence import suite

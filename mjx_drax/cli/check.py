@@ -1,6 +1,6 @@
-"""Say what becomes of a model of your own, and whether MJX computes it as MuJoCo does.
+"""Say whether a model of your own can be used, and how it is understood.
 
-This is about joints, actuators and contacts, and how far one step of MJX and its derivatives are
+The report has joints, actuators and contacts, and how far one step of MJX and its derivatives are
 from MuJoCo's C engine. The exit status is 0 if the model can be used.
 """
 

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str], None]
 
+TASK = "a name from `mjx-drax list`, or the beginning of one, such as cartpole"
+
 
 def at_least_1(text: str) -> int:
     """The type of an argument that counts something."""

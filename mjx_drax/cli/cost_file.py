@@ -20,7 +20,7 @@ A cost file is Python. It defines at least one of
   running_cost(data, u), terminal_cost(data)           scalars
   running_residual(data, u), terminal_residual(data)   vectors: adds half the squared norm
 on mjx.Data (qpos, qvel, data.site("tip").xpos, data.sensor("touch").data, ...), where any
-function may have a parameter `knot` besides (time, index, dt, data, parameters), and may define
+function may have one more parameter, `knot` (time, index, dt, data, parameters), and may define
   goal(data) -> bool       what a replay in MuJoCo must reach
   equality(data, u), terminal_equality(data)       vectors held at 0
   inequality(data, u), terminal_inequality(data)   vectors held <= 0
@@ -39,12 +39,12 @@ function may have a parameter `knot` besides (time, index, dt, data, parameters)
   actuators                for a model without: "torque", {"torque": limit} or {"position": kp}
   derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin
-Other names are yours, but for those that are nearly one of these: they are taken for slips.
+Other names are yours. One that is nearly one of these is refused, as a spelling mistake.
 """
 
 FUNCTION_ALIKE, VALUE_ALIKE = 0.77, 0.9
 """How much of a name has to be that of a known one to be taken for a slip: `final_cost` is one,
-the numbers `u_init` and `x_goal` are not."""
+the numbers `u_first` and `x_goal` are not."""
 
 
 def load(model: str, cost: str, horizon: float | None) -> tuple[Problem, Restarts]:

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the files beside the result."""
+    """Write the files beside the result; the status is 1 if some of them cannot be."""
     wanted = chosen(options)
     if not wanted:
         flags = ", ".join(f"--{name}" for name in exporters())
@@ -32,11 +32,21 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.solution.solution import Solution
 
     solution = Solution.load(options.folder)
+    possible, refused = [], []
     for each in wanted:
-        each.check(solution.problem)
+        try:
+            each.check(solution.problem)
+        except DraxError as error:
+            refused.append(f"{each.file}: {error}")
+        else:
+            possible.append(each)
+    if not possible:
+        raise DraxError(" ".join(refused))
     folder = writable(options.folder)
-    say(f"written to {folder}/: {', '.join(write(solution, folder, wanted, say))}")
-    return 0
+    for words in refused:
+        say(f"left out: {words}")
+    say(f"written to {folder}/: {', '.join(write(solution, folder, possible, say))}")
+    return 1 if refused else 0
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +64,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         dest="exports",
         action="append",
         metavar="MODULE:CLASS",
-        help="write with an exporter of your own, a subclass of mjx_drax.Exporter; again for more",
+        help="write with an exporter of your own, a subclass of mjx_drax.Exporter; may be repeated",
     )
     parser.set_defaults(exports=[])
 

@@ -1,4 +1,8 @@
-"""List the tasks."""
+"""List the tasks.
+
+The beginning of a name is enough, if no other name begins so: `mjx-drax solve cartpole`. Tasks
+"from MJCF" have a model, which MuJoCo's C engine replays; the others have dynamics in Python.
+"""
 
 from __future__ import annotations
 
@@ -16,4 +20,5 @@ def run(options: argparse.Namespace) -> int:
     width = max(map(len, tasks.names()))
     for name in tasks.names():
         print(f"{name:{width}}  {tasks.summary(name)}")
+    print("\nThe beginning of a name is enough: mjx-drax solve cartpole")
     return 0

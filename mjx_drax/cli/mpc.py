@@ -11,8 +11,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from mjx_drax import tasks
 from mjx_drax.base.errors import require_not_negative
-from mjx_drax.cli.common import at_least_1, make, say, say_nothing
+from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
 
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "chains": (at_least_1, 8, "number of chains; default 8"),
@@ -35,7 +36,7 @@ NUMBERS: dict[str, tuple[Any, Any, str]] = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The task, numbers, and what to write."""
-    parser.add_argument("task", help="a name from `mjx-drax list`")
+    parser.add_argument("task", help=TASK)
     for name, (kind, default, words) in NUMBERS.items():
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=words)
     parser.add_argument(
@@ -51,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Drive the model, and report; what cannot work is refused before anything compiles."""
-    from mjx_drax import tasks
+    tasks.full_name(options.task)  # answers at once, before heavy imports
     from mjx_drax.control import trials as runs
     from mjx_drax.control.mpc import MPC
     from mjx_drax.control.plant import Plant

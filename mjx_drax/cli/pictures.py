@@ -15,6 +15,7 @@ NAMES = (
     "optima.png",
     "video.mp4",
     "plan.mp4",
+    "comparison.mp4",
     "timelapse.png",
     "film.mp4",
 )

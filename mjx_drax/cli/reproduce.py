@@ -23,6 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="instead of the published or usual number",
     )
+    parser.add_argument(
+        "--full",
+        action="store_true",
+        help="the sizes of the paper, for a GPU; without it some ten minutes on two CPU cores",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -30,7 +35,8 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.kernels.compilation import keep_programs
 
     keep_programs()
-    numbers = reproduce.run(options.name, options.out, options.chains, options.iterations)
+    sizes = options.chains, options.iterations, options.full
+    numbers = reproduce.run(options.name, options.out, *sizes)
     from mjx_drax.studies.reproduce.output import table
 
     say(table(numbers))

@@ -1,7 +1,7 @@
-"""Solve a task, or a model and cost of your own; replay it; film it.
+"""Solve a task, or a model and cost of your own; replay the answer and film it.
 
 The exit status is 0 only if the best trajectory is certified: its replay reaches the goal and keeps
-all bounds and constraints. It is optimal too if its residual is below a tolerance.
+all bounds and constraints. It is also optimal if its residual is below a tolerance.
 
 """
 
@@ -13,9 +13,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import cost_file, export, pictures
-from mjx_drax.cli.common import at_least_1, make, say, say_nothing
+from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
 
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
@@ -24,14 +25,14 @@ if TYPE_CHECKING:
 
 __doc__ += cost_file.HELP
 
-LOOK = ("camera", "size", "fps", "speed")
+LOOK = ("camera", "size", "fps", "speed", "caption")
 """What a user may say about videos and films."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to solve, how, and what to write."""
     add = parser.add_argument
-    add("task", nargs="?", help="a name from `mjx-drax list`")
+    add("task", nargs="?", help=TASK)
     add("--model", metavar="XML", help="MJCF file of your own, with --cost")
     add("--cost", metavar="PY", help="Python file with the cost (see above)")
     add("--chains", type=at_least_1, metavar="N", help="number of chains")
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--iterations",
         type=at_least_1,
         metavar="K",
-        help="iterations with noise of an attempt; those without keep their share",
+        help="iterations with noise of an attempt; those without noise change in proportion",
     )
     add("--seed", type=int, default=0, metavar="S", help="default 0")
     add("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
@@ -47,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--checkpoint",
         metavar="FILE",
-        help="written every half minute; where it is there, the solve goes on from it",
+        help="save the state of the solve every half minute; if the file exists, go on from it",
     )
     add("--no-video", action="store_true", help="leave out videos and timelapse.png")
     add(
@@ -55,17 +56,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const="",
         metavar="FILE",
-        help="also film how the knots condense into the motion: .mp4, .gif or .webp; "
+        help="also film how the knots of all chains become a motion: .mp4, .gif or .webp; "
         "default DIR/film.mp4",
     )
     add(
         "--camera",
         metavar="NAME",
-        help="a camera of the model, or free: one that frames the whole motion",
+        help="a camera of the model; free: one that shows the whole motion; follow: one that goes "
+        "with the robot",
     )
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]")
-    add("--fps", type=float, metavar="N", help="frames per second")
+    add("--fps", type=float, metavar="N", help="frames per second; default 30")
     add("--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion")
+    add(
+        "--no-caption",
+        dest="caption",
+        action="store_false",
+        default=None,
+        help="no text under videos and films",
+    )
+    add(
+        "--side-by-side",
+        action="store_true",
+        help="also film plan and replay beside each other: comparison.mp4",
+    )
     export.add_flags(parser)
     add(
         "--set",
@@ -74,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="a setting of the solver, as in attempts=3, flow.tail=100 or "
-        "flow.noise=Geometric(3,0.001); again for more; a wrong name lists them all",
+        "flow.noise=Geometric(3,0.001); may be repeated; a wrong name lists all settings",
     )
     add(
         "--tolerance",
@@ -82,22 +96,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KIND=VALUE",
-        help="which violations of a replay are tolerated, in your units, as in inequality=0.01 or "
-        "state_bounds=1e-3,1e-2; relative=0.005 is the share of a scale of the problem's own for "
-        "all others; again for more; a wrong name lists them all",
+        help="how large a violation of a replay may be, in your units: inequality=0.01 or "
+        "state_bounds=1e-3,1e-2; relative=0.005 is for all other kinds, a share of a scale that is "
+        "measured; may be repeated; a wrong name lists all kinds",
     )
     add(
         "--residual",
         type=float,
         metavar="R",
-        help="residual below which a chain is optimal and stops, the tolerance= of Python; "
+        help="a chain with a smaller residual is optimal and stops (Python: tolerance=); "
         "default 1e-4, in float64 1e-8",
     )
     add(
         "--max-iterations",
         type=at_least_1,
         metavar="N",
-        help="of the polish that brings it there, after the noise; default 200",
+        help="at most so many of the polish, which makes the residual small; default 200",
     )
     add(
         "--precision",
@@ -125,6 +139,8 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(options: argparse.Namespace) -> int:
     """Solve, save and draw; what cannot work is refused before anything compiles."""
+    if options.task is not None:
+        tasks.full_name(options.task)  # answers at once, before heavy imports
     import jax
 
     with jax.enable_x64(True) if options.precision == 64 else nullcontext():
@@ -149,8 +165,9 @@ def _run(options: argparse.Namespace) -> int:
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = {name: getattr(options, name) for name in LOOK if getattr(options, name) is not None}
-    if look or options.film is not None:
-        require_drawing(problem, draw=draw, **look)
+    seen = {name: value for name, value in look.items() if name != "caption"}
+    if look or options.film is not None or options.side_by_side:
+        require_drawing(problem, draw=None if options.side_by_side else draw, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)
     tell = say_nothing if options.quiet or options.json else say
 
@@ -173,6 +190,10 @@ def _run(options: argparse.Namespace) -> int:
     written = ["result.json", "result.npz", *pictures.write_plots(solution, folder, draw)]
     if not options.no_video:
         written += pictures.write_video(solution, folder, draw, look)
+    if options.side_by_side:
+        from mjx_drax.view.video import render_comparison
+
+        written.append(render_comparison(solution, folder / "comparison.mp4", **seen).name)
     if film is not None:
         from mjx_drax.view.diffusion import render_diffusion
 
@@ -236,8 +257,6 @@ def _asked(options: argparse.Namespace) -> Asked:
             raise DraxError(
                 f"both the task {options.task!r} and --model or --cost are given: choose one."
             )
-        from mjx_drax import tasks
-
         task = tasks.load(options.task)
         problem, solver = make(task, options.horizon), Restarts()
         chains, draw = getattr(task, "CHAINS", 64), getattr(task, "draw", None)

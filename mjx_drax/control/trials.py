@@ -26,6 +26,9 @@ from mjx_drax.problem.problem import Problem
 SETTLE = 4.0
 """Time without pushes at the end of a run [s], at least."""
 
+ARROW, SHOWN = 0.4, 0.3
+"""Of pushes in films: length of the strongest, in sizes of the model; the least time [s]."""
+
 PERCENTILES = 50, 90, 99
 
 
@@ -241,11 +244,27 @@ def save(numbers: dict[str, Any], folder: Path) -> Path:
 
 
 def film(problem: Problem, motion: Motion, path: str | os.PathLike[str], **look: Any) -> Path:
-    """A film of one run; see `rendering.render_motion`."""
+    """A film of one run, with an arrow while a push lasts; see `view.video.render_motion`."""
+    from mjx_drax.view.scene import posed
     from mjx_drax.view.video import render_motion
 
     dynamics: Any = problem.dynamics
     lines_ = [f"{problem.name}, model predictive control", "t = {time}"]
     lines_ += [f"push of {p.force[0]:+.1f} N on {p.body} at {p.time:.2f} s" for p in motion.pushes]
-    qpos = motion.states[:, : dynamics.mj_model.nq]
-    return render_motion(dynamics.mj_model, qpos, motion.times, path, overlay=lines_, **look)
+    model = dynamics.mj_model
+    qpos = motion.states[:, : model.nq]
+    strongest = max((np.linalg.norm(p.force) for p in motion.pushes), default=1.0)
+    length = ARROW * float(model.stat.extent)
+
+    def arrows(time: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        found = []
+        now = min(int(np.searchsorted(motion.times, time)), len(qpos) - 1)
+        pose = next(posed(model, qpos[now : now + 1]))
+        for push in motion.pushes:
+            if push.time <= time < push.time + max(push.lasts, SHOWN):
+                vector = length * np.asarray(push.force) / strongest
+                centre = pose.xipos[model.body(push.body).id]
+                found.append((centre - vector, vector))  # it ends where it pushes
+        return found
+
+    return render_motion(model, qpos, motion.times, path, overlay=lines_, arrows=arrows, **look)

@@ -95,6 +95,8 @@ def from_function(
     data: Any = None,
     goal: Callable[[Any], Any] | None = None,
     guess: Callable[[Array], Trajectory] | None = None,
+    x_names: Sequence[str] = (),
+    u_names: Sequence[str] = (),
     name: str = "problem",
 ) -> Problem:
     """A problem whose dynamics are a JAX function f(x (nx,), u (nu,)) -> x_next (nx,).
@@ -135,6 +137,8 @@ def from_function(
             time [s] that returns one. Functions with a parameter `knot` read them there.
         goal: goal(x_K) -> bool, what a replay must reach.
         guess: guess(key) -> Trajectory, instead of the scatter boxes.
+        x_names, u_names: names of the entries of states and controls, such as "angle [rad]", for
+            tables, plots and errors; a class of dynamics has them as attributes instead.
         name: used in files and tables.
 
     Raises:
@@ -163,8 +167,15 @@ def from_function(
     start = vector("x_init", x_init)
     nx = start.shape[0]
     bounds = box(nx, nu, x_bounds, u_bounds)
+    named = {"x_names": _names("x_names", x_names, nx), "u_names": _names("u_names", u_names, nu)}
     if isinstance(f, Dynamics):
         dynamics = f
+        for label, value in named.items():
+            if value:
+                raise DraxError(
+                    f"{label} is given, and {type(f).__name__} is a class of dynamics: set {label} "
+                    "in the class."
+                )
     else:
         require_functions(f=f)
         if phases and not takes_knot(f):
@@ -172,7 +183,7 @@ def from_function(
                 "the horizon is free, and f has no parameter knot: take the step from it, "
                 "f(x, u, knot) with knot.dt."
             )
-        dynamics = FunctionDynamics(as_partial(f), dt, nx, nu)
+        dynamics = FunctionDynamics(as_partial(f), dt, nx, nu, **named)
     scatter = scatter_box(bounds, start, jnp.ones(nx), x_scatter, u_scatter)
     near = 1.0 if dynamics.kinked or dynamics.nx != dynamics.ndx else 0.0
     choices = Choices(x_init_bounds, parameters, phases, rates, u_init, rate_bounds)
@@ -299,6 +310,15 @@ def _require_knots(part: Any, label: str, times: np.ndarray) -> None:
 
 def _checks_knots(node: Any) -> bool:
     return hasattr(node, "check_knots")
+
+
+def _names(label: str, names: Sequence[str], count: int) -> tuple[str, ...]:
+    """Names of the entries of a vector, all different; () if none are given."""
+    given = (names,) if isinstance(names, str) else tuple(names)
+    texts = all(isinstance(name, str) and name.strip() for name in given)
+    if given and not (texts and len(set(given)) == len(given) == count):
+        raise DraxError(f"{label} is {shown(names)}: give {count} different text(s), or none.")
+    return given
 
 
 def require_name(name: object) -> None:

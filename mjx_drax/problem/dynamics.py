@@ -39,6 +39,8 @@ class Dynamics:
         state_damping: damping of states beside that of controls in `GaussNewton`.
         twice: whether the polish differentiates f twice; else it learns what curvature f has.
         checked: f has been tried where it was made, and need not be traced once more.
+        x_names, u_names: of the entries of states and controls, for tables, plots and errors, such
+            as "angle [rad]"; without them x0, x1, ... and u0, u1, ...
     """
 
     nx: int
@@ -48,6 +50,8 @@ class Dynamics:
     state_damping: float = 1.0
     twice: bool = True
     checked: bool = False
+    x_names: tuple[str, ...] = ()
+    u_names: tuple[str, ...] = ()
 
     @property
     def ndx(self) -> int:
@@ -187,6 +191,8 @@ class FunctionDynamics(Dynamics):
     dt: float
     nx: int = field(metadata=Static)
     nu: int = field(metadata=Static)
+    x_names: tuple[str, ...] = field(default=(), metadata=Static)
+    u_names: tuple[str, ...] = field(default=(), metadata=Static)
 
     def step(self, x: Array, u: Array) -> Array:
         """f(x, u), (nx,)."""

@@ -588,7 +588,8 @@ class Search:
         self._record()
         self._save()
         if self.progress is not None:
-            self.progress(done, max(self.settings.iterations, done), stage.now.info)
+            begun = done - stage.step + self.flow.iterations + self.settings.after
+            self.progress(done, max(begun, done), stage.now.info)
 
     def _record(self) -> None:
         """Record knots too, if asked for."""

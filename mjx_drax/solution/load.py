@@ -328,10 +328,12 @@ def _inner_dynamics(summary: dict[str, Any], arrays: Arrays, further: int) -> Dy
     dt = summary["dt"]
     if "model.binary" not in arrays:
         nx, nu = (arrays[f"solution.trajectories.{z}"].shape[-1] for z in "xu")
+        names: Any = {name: tuple(given) for name, given in summary.get("names", {}).items()}
         sizes = _missing("f"), dt, nx - further, nu
         if summary.get("vector_states", True):
-            return FunctionDynamics(*sizes)
-        return _Manifold(*sizes, ndx=arrays["solution.gains"].shape[-1] - further)
+            return FunctionDynamics(*sizes, **names)
+        ndx = arrays["solution.gains"].shape[-1] - further
+        return _Manifold(*sizes, **names, ndx=ndx)
     mj_model, source = _model(summary, arrays)
     x_init = np.asarray(arrays["problem.x_init"], float)
     bounded = bounded_joints(mj_model, x_init[: mj_model.nq + mj_model.nv + mj_model.na])

@@ -29,15 +29,15 @@ def state_names(dynamics: Dynamics) -> list[str]:
     """Names of the entries of a state, nx of them.
 
     For a model qpos_JOINT, qvel_JOINT and act_ACTUATOR, in MuJoCo's units; joints with several
-    coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise x0,
-    x1, ... Behind them are the names of what the problem leaves open: start_NAME, parameters, step
-    or step_PHASE, and before_NAME of the last controls.
+    coordinates add _x, _y, _z, _qw, _qx, _qy, _qz, and _vx, _vy, _vz, _wx, _wy, _wz. Otherwise the
+    `x_names` of the dynamics, or x0, x1, ... Behind them are the names of what the problem leaves
+    open: start_NAME, parameters, step or step_PHASE, and before_NAME of the last controls.
     """
     if isinstance(dynamics, Extended):
         return [*state_names(dynamics.inner), *_further_names(dynamics)]
     model = mujoco_model(dynamics)
     if model is None:
-        return [f"x{i}" for i in range(dynamics.nx)]
+        return list(dynamics.x_names) or [f"x{i}" for i in range(dynamics.nx)]
     return [
         *_joint_names(model, "qpos", _POSITIONS),
         *_joint_names(model, "qvel", _VELOCITIES),
@@ -77,10 +77,12 @@ def difference_names(dynamics: Dynamics) -> list[str]:
 
 
 def control_names(dynamics: Dynamics) -> list[str]:
-    """Names of the entries of a control, nu of them: ctrl_ACTUATOR, or u0, u1, ..."""
+    """Names of the entries of a control, nu of them: ctrl_ACTUATOR, `u_names`, or u0, u1, ..."""
+    if isinstance(dynamics, Extended):
+        return control_names(dynamics.inner)
     model = mujoco_model(dynamics)
     if model is None:
-        return [f"u{i}" for i in range(dynamics.nu)]
+        return list(dynamics.u_names) or [f"u{i}" for i in range(dynamics.nu)]
     return [f"ctrl_{model.actuator(i).name or i}" for i in range(model.nu)]
 
 

@@ -34,7 +34,7 @@ from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of, table
 from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
-from mjx_drax.solution.report import counts, html
+from mjx_drax.solution.report import INTERRUPTED, counts, html
 from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
 from mjx_drax.solution.violations import Violation
 
@@ -140,6 +140,7 @@ class Minimum:
         broken = "" if where is None else f": {where.told(self.program)}"
         found = optimality(float(self.residual[best]), self.tolerance, self.polished[best])
         return [
+            *([INTERRUPTED] if self.interrupted else []),
             f"chains         {len(self.cost)}: {counts(self.status)}",
             f"best           cost {self.cost[best]:.5g}, max|h| {self.max_defect[best]:.1e}",
             f"optimality     {found}",

@@ -98,6 +98,7 @@ class Bar:
             self._best = np.asarray(info.cost)[feasible].min(initial=self._best)
             numbers = f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
             bar.set_postfix_str(numbers, False)
+        bar.total = total  # grows with each further attempt
         bar.update(done - bar.n)
 
     def __exit__(self, *_: object) -> None:

@@ -18,6 +18,8 @@ LOOK = (
 )
 """Where to look if nothing is certified."""
 
+INTERRUPTED = "interrupted    the solve was ended before its time; this is the best until then"
+
 LABEL = 15
 """Characters of a line that name what it is about."""
 
@@ -34,6 +36,7 @@ def lines(solution: Results) -> list[str]:
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     return [
+        *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
         f"best           cost {solution.replay_cost[best]:.5g} when replayed "
         f"{solution.replay_mode}; plan: {solution.cost[best]:.5g}, max|h| "
@@ -127,6 +130,8 @@ def _residual(optimum: Optimum) -> str:
 
 def _advice(solution: Results) -> str:
     """What to try when no chain could be certified; the shell has the same names."""
+    if solution.interrupted:
+        return "the solve was interrupted. Let it go on to its end."
     where = solution.where(solution.best_chain)
     if where is not None:
         unfinished = solution.polished[solution.best_chain] == UNFINISHED

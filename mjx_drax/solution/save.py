@@ -49,6 +49,7 @@ def summary(solution: Results) -> dict[str, Any]:
     best, certificate = solution.best_chain, solution.certificate
     status, polished = solution.status, solution.polished
     dynamics = solution.problem.dynamics
+    own = dynamics.inner if isinstance(dynamics, Extended) else dynamics
     model = mjx_dynamics(dynamics)
     where = solution.where(best)
     whole: dict[str, Any] = {
@@ -63,6 +64,7 @@ def summary(solution: Results) -> dict[str, Any]:
         "has_goal": solution.problem.goal is not None,
         "contacts": None if model is None else model.contacts,
         "vector_states": dynamics.nx == dynamics.ndx and not _of_a_manifold(dynamics),
+        "names": {"x_names": own.x_names, "u_names": own.u_names},
         "free": solution.problem.free,
         "extended": extended_data(dynamics),
         "settings": to_data(solution.solver),

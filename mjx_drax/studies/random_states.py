@@ -38,9 +38,16 @@ HEADER = (
 )
 
 
-def values(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The value of states (N, 2) by dynamic programming, and whether they end upright, (N,)."""
-    ends = [np.linspace(-reach, reach, count) for reach, count in (ANGLES, VELOCITIES)]
+def values(
+    problem: Problem, x: np.ndarray, grid_size: tuple[int, int] = (ANGLES[1], VELOCITIES[1])
+) -> tuple[np.ndarray, np.ndarray]:
+    """The value of states (N, 2) by dynamic programming, and whether they end upright, (N,).
+
+    A smaller grid reaches less far in angle, with the same distance between angles.
+    """
+    reach = ANGLES[0] * (grid_size[0] - 1) / (ANGLES[1] - 1)
+    reaches = zip((reach, VELOCITIES[0]), grid_size, strict=True)
+    ends = [np.linspace(-end, end, count) for end, count in reaches]
     grid = jnp.asarray(np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 2))
     box = problem.bounds
     controls = jnp.linspace(box.u_lower[0], box.u_upper[0], CONTROLS)

@@ -23,7 +23,14 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import between, finite, interpolated, moved
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.view.drawing import Canvas, knot_at
-from mjx_drax.view.frames import Frame, captioned, even_size, text_box, video_path, write
+from mjx_drax.view.frames import (
+    Frame,
+    caption_height,
+    captioned,
+    even_size,
+    video_path,
+    write,
+)
 from mjx_drax.view.geoms import Floats
 from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import FREE, Scene, body_positions, camera_for, travelling_body
@@ -63,6 +70,7 @@ def render_diffusion(
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
+    caption: bool = True,
 ) -> Path:
     """Films how the best chain's knots became its motion, then that motion as it was replayed.
 
@@ -84,6 +92,7 @@ def render_diffusion(
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes, one line of
         it with a vertex for each state; needed for problems without a model.
+      caption: whether there is a strip with text.
 
     Raises:
       DraxError: nothing was recorded, a setting that cannot be used, or neither model nor `draw`.
@@ -105,20 +114,24 @@ def render_diffusion(
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
     width, height = even_size(size)
+    lines, model = outcome_lines(solution), mujoco_model(problem.dynamics)
+    moments = _moments(shown[0], seconds, fps)
+    told = [_caption(solution, shown[0], at) if caption else [] for at in moments]
+    lines = lines if caption else []
     below = 2 * round(_STRIP * height / 2)
+    text = caption_height([*told, lines], height - below, width)
     states = finite(solution.replayed[0])
     times = problem.times[: len(states)]
     film = Film(
         shown=shown,
         colors=Colors.of(shown[0]),
-        moments=_moments(shown[0], seconds, fps),
+        moments=moments,
         states=states,
         times=times,
         frame_times=frame_times(times, fps, speed),
-        size=(width, height - below),
+        size=(width, height - below - text),
     )
-    lines, model = outcome_lines(solution), mujoco_model(problem.dynamics)
-    captions = [(_caption(solution, shown[0], at), 0.0, at) for at in film.moments]
+    captions = [(its, 0.0, at) for its, at in zip(told, film.moments, strict=True)]
     captions += [(lines, time, film.moments[-1]) for time in film.frame_times]
 
     def frames() -> Generator[Frame, None, None]:
@@ -126,11 +139,10 @@ def render_diffusion(
             pictures = _robot_pictures(film, model, ghosts, FREE if camera is None else camera)
         else:
             assert draw is not None  # as checked
-            left = text_box(lines, height - below, width)[1][2] / width
-            pictures = _task_pictures(film, draw, np.asarray(problem.x_init, float), left)
+            pictures = _task_pictures(film, draw, np.asarray(problem.x_init, float))
         strip = CurveStrip(shown[0], film.colors, below, width)
-        for picture, (text, time, at) in zip(pictures, captions, strict=True):
-            yield np.concatenate([captioned(picture, text, time), strip.frame(at)])
+        for picture, (its, time, at) in zip(pictures, captions, strict=True):
+            yield np.concatenate([captioned(picture, its, time, text), strip.frame(at)])
 
     return write(path, frames(), fps)
 
@@ -306,13 +318,13 @@ def _robot_pictures(
             yield renderer.render(scene.content)
 
 
-def _task_pictures(film: Film, draw: Draw, x_init: Floats, left: float) -> Iterator[Frame]:
-    """The chains' paths on what a task draws; a share of the width is left to the caption."""
+def _task_pictures(film: Film, draw: Draw, x_init: Floats) -> Iterator[Frame]:
+    """The chains' paths on what a task draws."""
     from matplotlib.collections import LineCollection
 
     points = [_traced(draw, chain.x.astype(float)) for chain in film.shown]
     width, height = film.size
-    canvas = Canvas.within(height, width, left=left)
+    canvas = Canvas(height, width, layout="constrained")
     axes = canvas.figure.add_subplot()
     artists = [
         LineCollection([], linewidths=2.6 if i == 0 else 1.0, zorder=5 if i == 0 else 4)

@@ -34,14 +34,6 @@ class Canvas:
         self.figure = Figure(((width + 0.5) / dpi, (height + 0.5) / dpi), dpi, **options)
         self.agg = FigureCanvasAgg(self.figure)
 
-    @classmethod
-    def within(cls, height: int, width: int, left: float = 0.0, top: float = 0.0) -> Canvas:
-        """One whose axes leave free a share of the width at the left and of the height above."""
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-        rect = (left, 0.0, 1.0 - left, 1.0 - top)
-        return cls(height, width, layout=ConstrainedLayoutEngine(rect=rect))
-
     def pixels(self) -> Frame:
         """A copy of what has been drawn."""
         return np.array(self.agg.buffer_rgba())[..., :3]

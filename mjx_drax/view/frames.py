@@ -21,16 +21,17 @@ if TYPE_CHECKING:
     from PIL import Image
     from PIL.ImageFont import FreeTypeFont as Font
 
-    Box = tuple[float, float, float, float]
-
 Frame = npt.NDArray[np.uint8]
 """A picture (height, width, 3)."""
 
 UNCERTIFIED = "NOT CERTIFIED"
-"""These words in a caption turn its box red."""
+"""These words in a caption turn it red."""
 
 SUFFIXES = (".mp4", ".gif", ".webp")
 
+_CLOCK = "00.00 s"  # where the time will stand
+_LETTERS = 30  # letters of a caption are this share of the height
+_LONG = 32  # a longer text of a caption may be broken [characters]
 _CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
 _WEBP_QUALITY = 60
 
@@ -125,44 +126,68 @@ def even_size(size: tuple[int, int]) -> tuple[int, int]:
     return width + width % 2, height + height % 2
 
 
-def captioned(frame: Frame, lines: Sequence[str], time: float) -> Frame:
-    """The frame with lines of text in a translucent box at its top left."""
-    if not lines:
+def captioned(frame: Frame, lines: Sequence[str], time: float, below: int) -> Frame:
+    """The frame, and under it a strip of `below` rows with text; see `caption_height`.
+
+    The strip is red if the text says `UNCERTIFIED`.
+    """
+    if not below:
         return frame
     from PIL import Image, ImageDraw
 
-    height, width = frame.shape[:2]
-    font, box = text_box(lines, height, width)
-    text = "\n".join(lines).replace("{time}", f"{time:.2f} s")
-    image = Image.fromarray(frame)
-    draw = ImageDraw.Draw(image, "RGBA")
-    margin = height // 40
-    fill = (150, 20, 20, 210) if UNCERTIFIED in text else (14, 18, 25, 185)
-    draw.rounded_rectangle(box, radius=margin // 2, fill=fill)
-    corner = (2 * margin, 2 * margin)
-    draw.multiline_text(corner, text, (240, 243, 247), font, spacing=margin // 2)
-    return np.asarray(image)
+    height, width = len(frame) + below, frame.shape[1]
+    font, rows = _fitted(tuple(lines), height, below, width)
+    red = any(UNCERTIFIED in line for line in lines)
+    image = Image.new("RGB", (width, below), (120, 22, 22) if red else (20, 25, 33))
+    text = "\n".join(rows).replace(_CLOCK, f"{time:.2f} s")
+    gap = font.size // 2
+    ImageDraw.Draw(image).multiline_text((gap, gap), text, (240, 243, 247), font, spacing=gap // 2)
+    return np.concatenate([frame, np.asarray(image)])
 
 
-def text_box(lines: Sequence[str], height: int, width: int) -> tuple[Font, Box]:
-    """The font, and the box (left, top, right, bottom) around the text with its margin."""
-    return _fitted("\n".join(lines).replace("{time}", "00.00 s"), height, width)
+def caption_height(captions: Iterable[Sequence[str]], height: int, width: int) -> int:
+    """Rows of pixels, an even number, that hold any of these captions; 0 if all are empty.
+
+    Args:
+      captions: each a list of short texts, in which `{time}` becomes the frame's time.
+      height, width: of a frame with its strip [pixels].
+    """
+    most = 0
+    for lines in set(map(tuple, captions)):
+        if lines:
+            font = _font(max(9, height // _LETTERS))
+            rows = _rows(lines, font, width)
+            gap = font.size // 2
+            most = max(most, int(2 * gap + len(rows) * (sum(font.getmetrics()) + gap // 2)))
+    return min(2 * (-(-most // 2)), 2 * (height // 4))
 
 
-@lru_cache(maxsize=16)
-def _fitted(text: str, height: int, width: int) -> tuple[Font, Box]:
-    """The largest font, up to 1/28 of the height, with which the text fits, and its box."""
-    from PIL import Image, ImageDraw
-
-    draw = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    margin = height // 40
-    corner = (2 * margin, 2 * margin)
-    for size in range(max(9, height // 28), 8, -1):
+@lru_cache(maxsize=64)
+def _fitted(lines: tuple[str, ...], height: int, below: int, width: int) -> tuple[Font, list[str]]:
+    """The largest font, up to the usual one, with which the texts fit into a strip; its rows."""
+    for size in range(max(9, height // _LETTERS), 8, -1):
         font = _font(size)
-        left, top, right, bottom = draw.multiline_textbbox(corner, text, font, spacing=margin // 2)
-        if right <= width - 2 * margin and bottom <= height - 2 * margin:
+        rows, gap = _rows(lines, font, width), size // 2
+        if 2 * gap + len(rows) * (sum(font.getmetrics()) + gap // 2) <= below:
             break
-    return font, (left - margin, top - margin, right + margin, bottom + margin)
+    return font, rows
+
+
+def _rows(lines: Sequence[str], font: Font, width: int) -> list[str]:
+    """Texts one after the other, in rows that fit the width; only long texts are broken."""
+    words = []
+    for line in lines:
+        line = line.replace("{time}", _CLOCK)
+        parts = line.split(" ") if len(line) > _LONG else [line]
+        words += [*parts[:-1], parts[-1] + "  "]
+    rows = [""]
+    for word in words:
+        longer = f"{rows[-1]} {word}".lstrip()
+        if font.getlength(longer.rstrip()) <= width - font.size or not rows[-1]:
+            rows[-1] = longer
+        else:
+            rows.append(word)
+    return rows
 
 
 def _font(size: int) -> Font:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.solution.names import control_names, difference_names, state_names
 
 if TYPE_CHECKING:
     from mjx_drax.problem.dynamics import Dynamics
@@ -22,7 +23,7 @@ def coordinates(dynamics: Dynamics) -> list[tuple[str, str]]:
     """
     model = mujoco_model(dynamics)
     if model is None:
-        return [(f"x[{i}]", "") for i in range(dynamics.nx // 2)]
+        return [(name, "") for name in state_names(dynamics)[: dynamics.nx // 2]]
     found: list[tuple[str, str]] = []
     for joint, kind in _joints(model):
         if kind == _FREE:
@@ -38,7 +39,7 @@ def tangent_labels(dynamics: Dynamics) -> list[str]:
     """Names of the entries of a tangent vector, (ndx,)."""
     model = mujoco_model(dynamics)
     if model is None:
-        return [f"x[{i}]" for i in range(dynamics.ndx)]
+        return difference_names(dynamics)
     names = [name for name, _ in coordinates(dynamics)]
     velocities = [f"{name}, velocity" for name in names]
     return [*names, *velocities, *(f"act[{i}]" for i in range(model.na))]
@@ -48,7 +49,7 @@ def state_groups(dynamics: Dynamics) -> dict[str, dict[int, str]]:
     """Kinds of entries of a state, each with the columns that hold it and their labels."""
     model = mujoco_model(dynamics)
     if model is None:
-        return {"states": {i: f"x[{i}]" for i in range(dynamics.nx)}}
+        return {"states": dict(enumerate(state_names(dynamics)))}
     positions: dict[int, str] = {}
     orientations: dict[int, str] = {}
     for (joint, kind), column in zip(_joints(model), model.jnt_qposadr.tolist(), strict=True):
@@ -73,7 +74,7 @@ def control_labels(dynamics: Dynamics) -> list[str]:
     """Names of the entries of a control, (nu,)."""
     model = mujoco_model(dynamics)
     if model is None:
-        return [f"u[{i}]" for i in range(dynamics.nu)]
+        return control_names(dynamics)
     return [model.actuator(i).name or f"actuator {i}" for i in range(dynamics.nu)]
 
 

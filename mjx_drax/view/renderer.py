@@ -56,6 +56,8 @@ class _OpenGLRenderer:
         self._gl.make_current()
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._cheap = _is_software()
+        skies = model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX.value
+        self._sky = None if skies.any() else _sky(height)
         samples = int(model.vis.quality.offsamples)
         try:
             if self._cheap:  # multisampling doubles a frame's time on a CPU
@@ -73,13 +75,30 @@ class _OpenGLRenderer:
             scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         frame = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
         mujoco.mjr_render(self._rect, scene, self._mjr)
-        mujoco.mjr_readPixels(frame, None, self._rect, self._mjr)
-        return frame[::-1]  # OpenGL counts rows from below
+        if self._sky is None:
+            mujoco.mjr_readPixels(frame, None, self._rect, self._mjr)
+            return frame[::-1]  # OpenGL counts rows from below
+        depth = np.empty((self._rect.height, self._rect.width), np.float32)
+        mujoco.mjr_readPixels(frame, depth, self._rect, self._mjr)
+        empty = _is_empty(depth)[::-1]
+        return np.where(empty[..., None], self._sky, frame[::-1])
 
     def close(self) -> None:
         self._gl.make_current()
         self._mjr.free()
         self._gl.free()
+
+
+def _sky(height: int) -> Frame:
+    """A background for models that bring no sky, (height, 1, 3): blue above, nearly white below."""
+    share = np.linspace(0.0, 1.0, height)[:, None, None]
+    above, below = np.array([120.0, 160.0, 205.0]), np.array([232.0, 238.0, 244.0])
+    return np.asarray((1.0 - share) * above + share * below, np.uint8)
+
+
+def _is_empty(depth: np.ndarray) -> np.ndarray:
+    """Where nothing was drawn, (height, width): the depth there is that of the far plane."""
+    return (depth <= 0.0) | (depth >= 1.0)  # MuJoCo may turn the direction of depths
 
 
 def _is_software() -> bool:

@@ -6,7 +6,7 @@ color, so that one frame shows a whole motion.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +18,16 @@ from mjx_drax.view.geoms import Floats
 MAX_GEOMS = 20_000
 """Geoms in one scene; MuJoCo leaves out what would be more."""
 
-FREE = "free"
-"""The camera that sees the whole motion."""
+FREE, FOLLOW = "free", "follow"
+"""The camera that sees the whole motion, and the one that goes with the robot."""
+
+Arrow = tuple[Floats, Floats]
+"""A point and a vector from it, (3,) each [m]."""
 
 _MARGIN = 1.1  # factor on the free camera's distance
+_FAR = 3.0  # a robot travels far if its way is so many times its size
+_SUN = np.array([0.4, 0.5, -1.0])  # where light comes from in a model without lights: its direction
+_RED = np.array([0.85, 0.15, 0.1, 1.0])
 _POSES = 240  # so many poses of a motion decide where the free camera stands
 
 
@@ -42,6 +48,30 @@ class Scene:
         mujoco.mjv_updateScene(
             self._model, self.data, self._option, None, self._camera, kind.value, self.content
         )
+        if self._model.nlight == 0:
+            self._add_sun()
+
+    def _add_sun(self) -> None:
+        """Light from above, for models that bring none but the camera's own."""
+        light = self.content.lights[self.content.nlight]
+        light.headlight, light.castshadow = 0, 1
+        light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
+        light.dir[:] = _SUN / np.linalg.norm(_SUN)
+        light.pos[:] = -10.0 * _SUN * max(float(self._model.stat.extent), 1.0)
+        light.ambient[:], light.diffuse[:], light.specular[:] = 0.1, 0.5, 0.1
+        self.content.nlight += 1
+
+    def add_arrows(self, arrows: Sequence[Arrow]) -> None:
+        """Red arrows, such as forces."""
+        zero, turn, kind = np.zeros(3), np.eye(3).ravel(), mujoco.mjtGeom.mjGEOM_ARROW
+        for start, vector in arrows:
+            if self.content.ngeom >= self.content.maxgeom:
+                return
+            geom = self.content.geoms[self.content.ngeom]
+            mujoco.mjv_initGeom(geom, kind, zero, zero, turn, np.float32(_RED))
+            width = 0.08 * float(np.linalg.norm(vector))
+            mujoco.mjv_connector(geom, kind, width, start, start + 2.0 * vector)  # draws half of it
+            self.content.ngeom += 1
 
     def add_robot(self, qpos: Floats, opacity: float, color: npt.ArrayLike | None = None) -> None:
         """One more robot, translucent, at qpos (nq,), in its own colors or in one (3,)."""
@@ -120,21 +150,23 @@ def camera_for(
 ) -> mujoco.MjvCamera:
     """The camera asked for, for a motion qpos (T, nq) in frames of an aspect, width / height.
 
-    `wanted` is a camera's name or index, or `FREE`; None is the camera "main", or else `FREE`.
+    `wanted` is a camera's name or index, `FREE` or `FOLLOW`; None is the camera "main", or else
+    `FREE`, or `FOLLOW` where the robot travels far.
 
     Raises:
       DraxError: there is no such camera.
     """
     names = [model.camera(index).name for index in range(model.ncam)]
     if wanted is None:
-        wanted = "main" if "main" in names else FREE
-    if wanted == FREE and FREE not in names:
-        return _free_camera(model, qpos, aspect)
+        wanted = "main" if "main" in names else FOLLOW if _travels_far(model, qpos) else FREE
+    if wanted in (FREE, FOLLOW) and wanted not in names:
+        return _free_camera(model, qpos, aspect, follows=wanted == FOLLOW)
     index = names.index(wanted) if wanted in names else wanted
     if not isinstance(index, int | np.integer) or not 0 <= index < model.ncam:
         known = ", ".join(name or f"{i} (unnamed)" for i, name in enumerate(names)) or "none"
         raise DraxError(
-            f"no camera {shown(wanted)} in this model: use {FREE!r}, or of its own: {known}"
+            f"no camera {shown(wanted)} in this model: use {FREE!r}, {FOLLOW!r}, or of its own: "
+            f"{known}"
         )
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -142,8 +174,28 @@ def camera_for(
     return camera
 
 
-def _free_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoco.MjvCamera:
+def _travels_far(model: mujoco.MjModel, qpos: Floats) -> bool:
+    """Whether a body that moves in the plane or in space goes far, beside its size."""
+    body = travelling_body(model)
+    if body is None:
+        return False
+    way = np.ptp(body_positions(model, body, qpos), axis=0).max()
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
+    places = next(posed(model, qpos[:1])).geom_xpos[own & (model.geom_rbound > 0.0)]
+    bound = model.geom_rbound[own & (model.geom_rbound > 0.0)]
+    if not len(places):
+        return False
+    size = np.max(np.ptp(places, axis=0) + 2.0 * bound.max())
+    return bool(way > _FAR * size)
+
+
+def _free_camera(
+    model: mujoco.MjModel, qpos: Floats, aspect: float, follows: bool = False
+) -> mujoco.MjvCamera:
     """A camera that sees every moving geom in every pose of the motion.
+
+    One that follows keeps its distance and direction from the centre of mass of the body that
+    travels, and sees every geom of that robot.
 
     It looks in the direction of the camera "main" at qpos0, if there is one. With axes right, up
     and ahead, a ball of radius b at (x, y, z) from the middle of all is within a half angle a of
@@ -151,11 +203,18 @@ def _free_camera(model: mujoco.MjModel, qpos: Floats, aspect: float) -> mujoco.M
     """
     sized = model.geom_rbound > 0.0  # planes have none
     moving = sized & (model.body_weldid[model.geom_bodyid] != 0)
+    body = travelling_body(model) if follows else None
+    if body is not None:
+        moving &= model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
     chosen = moving if np.any(moving) else sized
     poses = qpos[np.unique(np.linspace(0, len(qpos) - 1, _POSES).astype(int))]
-    points = np.array([data.geom_xpos[chosen] for data in posed(model, poses)]).reshape(-1, 3)
+    points = np.array([data.geom_xpos[chosen] for data in posed(model, poses)])
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    if body is not None:
+        points = points - body_positions(model, body, poses)[:, None, :]
+        camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, body
+    points = points.reshape(-1, 3)
     camera.azimuth, camera.elevation = _direction(model)
     center, bound = model.stat.center, np.array([model.stat.extent])
     if points.size:

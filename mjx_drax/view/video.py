@@ -7,9 +7,8 @@ model by a function that the task brings, on matplotlib axes.
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,10 +20,17 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import finite, interpolated
 from mjx_drax.solution.results import optimality
 from mjx_drax.view.drawing import Canvas, knot_at
-from mjx_drax.view.frames import UNCERTIFIED, Frame, captioned, even_size, text_box, write
+from mjx_drax.view.frames import (
+    UNCERTIFIED,
+    Frame,
+    caption_height,
+    captioned,
+    even_size,
+    write,
+)
 from mjx_drax.view.geoms import Floats
 from mjx_drax.view.renderer import open_renderer
-from mjx_drax.view.scene import Scene, camera_for
+from mjx_drax.view.scene import Arrow, Scene, camera_for
 
 if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
@@ -32,7 +38,6 @@ if TYPE_CHECKING:
     from mjx_drax.view.drawing import Draw
 
 _HOLD = 0.5  # [s] the last frame stays this long
-_WIDTH = 44  # of a line of text [characters]
 
 
 def render(
@@ -46,11 +51,12 @@ def render(
     draw: Draw | None = None,
     chain: int | None = None,
     plan: bool = False,
+    caption: bool = True,
 ) -> Path:
     """Films a chain's motion as it was replayed, or as it was planned; returns the path.
 
-    Cost, max|h| and the replay's outcome, or what the plan breaks, stand in the picture. A motion
-    that turns non-finite is shown up to there.
+    Cost, max|h| and the replay's outcome, or what the plan breaks, stand under the picture. A
+    motion that turns non-finite is shown up to there.
 
     Args:
       solution: from `solve`.
@@ -64,6 +70,7 @@ def render(
       chain: the best one by default.
       plan: show the knots of the plan, which need not obey the dynamics: what a chain that failed
         was about to do. By default the better replay is shown.
+      caption: whether there is a strip with text.
 
     Raises:
       DraxError: a path, size, fps, speed, camera or chain that cannot be used, or neither a model
@@ -73,7 +80,7 @@ def render(
     chain = solution.chain_or_best(chain)
     states = states_of(solution, chain, plan)
     times = solution.times_of(chain)[: len(states)]
-    overlay = outcome_lines(solution, chain, plan)
+    overlay = outcome_lines(solution, chain, plan) if caption else []
     model = mujoco_model(solution.problem.dynamics)
     if model is not None:
         qpos, look = states[:, : model.nq], {"size": size, "camera": camera, "speed": speed}
@@ -81,6 +88,51 @@ def render(
     assert draw is not None  # as checked
     moments = frame_times(times, fps, speed)
     return write(path, _drawn_frames(draw, states, times, moments, overlay, even_size(size)), fps)
+
+
+def render_comparison(
+    solution: Solution,
+    path: str | os.PathLike[str],
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (960, 480),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+    chain: int | None = None,
+) -> Path:
+    """Films a chain's plan (left) and its better replay (right) side by side; returns the path.
+
+    The arguments are those of `render`, for problems with a model.
+
+    Raises:
+      DraxError: as `render`, or a problem without a model.
+    """
+    problem = solution.problem
+    check(problem, fps=fps, size=size, camera=camera, speed=speed)
+    model = mujoco_model(problem.dynamics)
+    assert model is not None  # as checked
+    chain = solution.chain_or_best(chain)
+    width, height = even_size(size)
+    told = outcome_lines(solution, chain)
+    overlay = [told[0], "left: plan, right: replay", *told[1:]]
+    below = caption_height([overlay], height, width)
+    half = 2 * (width // 4)
+    both = [states_of(solution, chain, plan)[:, : model.nq] for plan in (True, False)]
+    seen = camera_for(model, np.concatenate(both), camera, half / (height - below))
+    times = solution.times_of(chain)
+    moments = frame_times(times, fps, speed)
+
+    def frames() -> Generator[Frame, None, None]:
+        scene = Scene(model, seen)
+        with open_renderer(model, height - below, half) as renderer:
+            for time in moments:
+                sides = []
+                for qpos in both:
+                    scene.begin(interpolated(model, qpos, times[: len(qpos)], time))
+                    sides.append(renderer.render(scene.content))
+                yield captioned(np.concatenate(sides, axis=1), overlay, time, below)
+
+    return write(path, frames(), fps)
 
 
 def check(
@@ -143,6 +195,7 @@ def motion_frames(
     size: tuple[int, int] = (640, 480),
     camera: str | int | None = None,
     speed: float = 1.0,
+    arrows: Callable[[float], Sequence[Arrow]] = lambda time: (),
 ) -> Generator[Frame, None, None]:
     """Frames (height, width, 3) uint8 of a motion, the last one held for half a second.
 
@@ -150,12 +203,14 @@ def motion_frames(
       model: what moves.
       qpos: positions (T, nq), interpolated between their times (along geodesics for quaternions).
       times: when they are reached (T,) [s], not decreasing.
-      overlay: lines of text drawn on each frame; `{time}` becomes the frame's time.
+      overlay: texts in a strip under each frame; `{time}` becomes the frame's time.
       fps: frames per second.
       size: (width, height) [pixels]; odd ones are made even, which players ask for.
-      camera: a camera's name or index; "free" is one that sees the whole motion. None takes the
-        one called "main", or, in a model without one, the free one.
+      camera: a camera's name or index; "free" is one that sees the whole motion, "follow" one
+        that goes with the robot. None takes the one called "main"; in a model without one the free
+        one, or, for a robot that travels far, the one that follows.
       speed: of the motion; 0.5 is slow motion.
+      arrows: gives what is drawn besides at a time [s], such as pushes.
 
     Raises:
       DraxError: at once, for positions of the wrong shape or not finite, decreasing times, or an
@@ -166,13 +221,16 @@ def motion_frames(
     if isinstance(overlay, str):
         raise DraxError(f"overlay is {shown(overlay)}: give a list of lines, not one text.")
     width, height = even_size(size)
-    scene = Scene(model, camera_for(model, positions, camera, width / height))
+    below = caption_height([overlay], height, width)
+    above = height - below
+    scene = Scene(model, camera_for(model, positions, camera, width / above))
 
     def frames() -> Generator[Frame, None, None]:
-        with open_renderer(model, height, width) as renderer:
+        with open_renderer(model, above, width) as renderer:
             for time in moments:
                 scene.begin(interpolated(model, positions, knot_times, time))
-                yield captioned(renderer.render(scene.content), overlay, time)
+                scene.add_arrows(arrows(time))
+                yield captioned(renderer.render(scene.content), overlay, time, below)
 
     return frames()
 
@@ -185,7 +243,7 @@ def states_of(solution: Solution, chain: int, plan: bool) -> np.ndarray:
 
 
 def outcome_lines(solution: Solution, chain: int | None = None, plan: bool = False) -> list[str]:
-    """Lines of text about a chain, short ones, which leave the robot in view.
+    """Short texts about a chain, for a caption.
 
     Args:
       solution: from `solve`.
@@ -209,7 +267,7 @@ def outcome_lines(solution: Solution, chain: int | None = None, plan: bool = Fal
         f"bound violation {violation:.1g}",
         optimality(float(solution.residual[chain]), solution.tolerance, solution.polished[chain]),
         made,
-        *wrap(told, _WIDTH),
+        told,
         "t = {time}",
     ]
     if not solution.certified_chains[chain]:
@@ -237,10 +295,10 @@ def _drawn_frames(
     overlay: Sequence[str],
     size: tuple[int, int],
 ) -> Generator[Frame, None, None]:
-    """Frames at some moments [s] of states (T, nx), drawn again at each knot, below the overlay."""
+    """Frames at some moments [s] of states (T, nx), drawn again at each knot, and the overlay."""
     width, height = size
-    top = text_box(overlay, height, width)[1][3] / height
-    canvas, drawn = Canvas.within(height, width, top=top), -1
+    below = caption_height([overlay], height, width)
+    canvas, drawn = Canvas(height - below, width, layout="constrained"), -1
     for time in moments:
         knot = knot_at(times, time)
         if knot != drawn:
@@ -248,7 +306,7 @@ def _drawn_frames(
             draw(canvas.figure.add_subplot(), states[: knot + 1])
             canvas.agg.draw()
             drawn = knot
-        yield captioned(canvas.pixels(), overlay, time)
+        yield captioned(canvas.pixels(), overlay, time, below)
 
 
 def _checked_motion(

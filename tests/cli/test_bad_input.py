@@ -33,7 +33,6 @@ TASKS = [
 
 # fmt: off
 COMMANDS = [
-    ("none", lambda at: [], "COMMAND"),
     ("unknown", lambda at: ["sovle"], "sovle"),
     ("option", lambda at: ["solve", "pendulum", "--chain-count", "3"], "--chain-count"),
     ("nothing-to-solve", lambda at: ["solve"], "give a task"),

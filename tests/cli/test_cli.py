@@ -12,6 +12,7 @@ from inspect import signature
 
 import numpy as np
 import pytest
+from builders import At
 
 from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
 from mjx_drax.cli import cost_file, main, pictures
@@ -85,6 +86,22 @@ def test_a_reader_may_stop_reading():
     done = subprocess.run([sys.executable, "-c", code], stdout=writing, stderr=subprocess.PIPE)
     os.close(writing)
     assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_without_a_command_the_help_is_printed(capsys):
+    assert main([]) == 0
+    assert "usage: mjx-drax" in capsys.readouterr().out
+
+
+def test_an_unknown_task_is_refused_before_anything_heavy_is_imported():
+    code = (
+        "import sys; from mjx_drax.cli import main; "
+        "status = main(['solve', 'cartpole_swingpu']); "
+        "sys.exit(status + 10 * ('jax' in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert "choose cartpole_swingup, or another of" in done.stderr
 
 
 def test_list_names_every_task(capsys):
@@ -321,6 +338,14 @@ def test_a_cost_file_has_names_of_its_own(own):
     )
     problem, _ = cost_file.load(str(own / "slider.xml"), str(own / "mycost.py"), None)
     assert float(problem.bounds.u_upper[0]) <= 2.0
+
+
+def test_export_writes_what_it_can(tmp_path, capsys):
+    folder = At(tmp_path).saved("point_answer")  # without a model: no keyframes
+    assert main(["export", str(folder), "--csv", "--keyframes"]) == 1
+    out = capsys.readouterr().out
+    assert "left out: keyframes.xml: point has no MuJoCo model" in out
+    assert (folder / "replay.csv").exists()
 
 
 def test_errors_name_cause_and_fix(own, capsys):

@@ -6,8 +6,17 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from builders import made_up, point
 
-from mjx_drax import DraxError, Exporter, export_keyframes, from_mjcf, save_csv, save_dataset
+from mjx_drax import (
+    DraxError,
+    Exporter,
+    Solution,
+    export_keyframes,
+    from_mjcf,
+    save_csv,
+    save_dataset,
+)
 from mjx_drax.base.files import complete, require
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.solution.export import NothingToExport, exporter, exporters
@@ -42,7 +51,16 @@ def test_names_say_joint_and_actuator(slider):
     assert len(names) == model.nq + model.nv + model.na
     assert control_names(dynamics) == ["ctrl_push", "ctrl_1"]
     trap = load("bug_trap").make().dynamics
-    assert (state_names(trap), control_names(trap)) == (["x0", "x1", "x2"], ["u0", "u1"])
+    assert state_names(trap) == ["x [m]", "y [m]", "heading [rad]"]
+    assert control_names(trap) == ["speed [m/s]", "turn rate [rad/s]"]
+    plain = point().dynamics
+    assert (state_names(plain), control_names(plain)) == (["x0", "x1"], ["u0", "u1"])
+
+
+def test_names_are_saved(tmp_path):
+    problem = point(x_names=("a", "b"), u_names=("force [N]", "turn"))
+    loaded = Solution.load(made_up(problem).save(tmp_path)).problem.dynamics
+    assert (state_names(loaded), control_names(loaded)) == (["a", "b"], ["force [N]", "turn"])
 
 
 def test_a_table_has_a_row_for_every_knot(slider, tmp_path):

@@ -275,6 +275,7 @@ def test_ctrl_c_between_reports_keeps_what_there_is():
 
     solution = solve(reach(), chains=3, solver=QUICK, progress=progress)
     assert solution.interrupted
+    assert str(solution).startswith("interrupted ")
     assert set(solution.status) <= {"interrupted", "feasible"}
     assert not solve(reach(), chains=3, solver=QUICK).interrupted
     assert seen == [(REPORT_EVERY, 80), (2 * REPORT_EVERY, 80)]

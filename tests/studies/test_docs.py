@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import mjx_drax
+from mjx_drax import tasks
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -21,20 +22,46 @@ def test_every_public_name_is_documented(name):
     assert not text.startswith(f"{name}(")  # what dataclasses write by themselves
 
 
-@pytest.mark.slow
-def test_the_reference_has_every_public_name(tmp_path):
-    written = runpy.run_path(str(ROOT / "docs" / "make_reference.py"))["write"](tmp_path)
-    page = written.read_text(encoding="utf-8")
+def test_the_site_has_every_public_name_and_task(tmp_path):
+    site = runpy.run_path(str(ROOT / "docs" / "make_site.py"))
+    site["write"](tmp_path)
+    reference = (tmp_path / "reference.md").read_text(encoding="utf-8")
     for name in mjx_drax.__all__:
-        if not inspect.ismodule(getattr(mjx_drax, name)):  # these have pages of their own
-            assert f'id="{name}"' in page
+        if callable(getattr(mjx_drax, name)):
+            assert f".{name}\n" in reference
+    gallery = (tmp_path / "gallery.md").read_text(encoding="utf-8")
+    for name in tasks.names():
+        assert f"## {name}\n" in gallery
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in tmp_path.glob("*.md"):
+        assert page.name in menu
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+            assert "://" in target or (tmp_path / target).exists(), (page.name, target)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
         if "://" not in target:
-            assert (page.parent / target).exists(), target
+            there = page.parent / target if target else page
+            assert there.exists(), target
+            assert not anchor or anchor in anchors(there), f"{target}#{anchor}"
+
+
+def anchors(page):
+    """What a link to a heading of the page may say after #."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_code_that_the_paper_page_names_exists():
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    pairs = re.findall(r"`([a-z_/]+\.py)`: (`\w[\w.]*`(?:, `\w[\w.]*`)*)", text)
+    assert len(pairs) > 10
+    for file, names in pairs:
+        source = (ROOT / "mjx_drax" / file).read_text(encoding="utf-8")
+        for name in re.findall(r"(\w+)`", names):
+            assert re.search(rf"(def|class) {name}\b", source), (file, name)
 
 
 @pytest.mark.slow

@@ -18,9 +18,12 @@ from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import (
     bug_trap,
     convergence,
+    direct_against_shooting,
+    multipliers,
     open_questions,
     parallel_table,
     settings,
+    theorem_2,
 )
 from mjx_drax.studies.reproduce.output import table
 from mjx_drax.studies.reproduce.settings import PENDULUM_FLOW, TRAP_FLOW
@@ -114,6 +117,46 @@ def test_batched_problems_start_where_they_should():
         np.testing.assert_allclose(own.max_defect(one), info.max_defect[i], atol=1e-6)
     u = np.asarray(knots.u, float)
     assert judge(problem, u, np.asarray(starts)).success[0]
+
+
+def test_theorem_2_where_the_answer_is_known():
+    """A = diag(mu - 1, 1) is positive definite, and the flow is stable, for mu > 1."""
+    zero, one = np.zeros(2), np.zeros(1)
+    optimum = theorem_2.Optimum(0.0, zero, one, np.diag([-1.0, 1.0]), np.array([[1.0, 0.0]]))
+    np.testing.assert_allclose(optimum.definite_from(), 1.0, rtol=2e-3)
+    np.testing.assert_allclose(optimum.stable_from(), 1.0, rtol=2e-3)
+    assert optimum.decay(0.5, 0.01) < 0 < optimum.decay(3.0, 0.01)
+    assert optimum.largest_step(0.5) is None
+    # of the iteration [[1 - 2a, -a], [6a, 1]] the determinant is 1 at a = 1 / 3
+    np.testing.assert_allclose(optimum.largest_step(3.0), 1 / 3, rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_theorem_2_at_the_pendulums_optimum():
+    numbers, figure = theorem_2.make(2, 500, barriers=(1e-2,), penalties=(1.0, 10.0))
+    (row,) = numbers["rows"]
+    assert 150 < row["mu* (A positive definite)"] < 250
+    assert 0.3 < row["linearized flow stable from mu"] < 1.0
+    assert 0.030 < row["largest α, μ = 10"] < 0.035
+    assert [energy["rises with μ|h|²"] for energy in numbers["energies"]] == [0.0, 0.0]
+    assert figure_is_drawn(figure)
+
+
+@pytest.mark.slow
+def test_without_multipliers_defects_stay():
+    numbers, figure = multipliers.make(chains=4, iterations=1500, penalties=(10.0,))
+    own, none = (row["median |h|²"] for row in numbers["rows"])
+    assert own < 0.5 * none
+    assert figure_is_drawn(figure)
+
+
+@pytest.mark.slow
+def test_direct_and_shooting_obey_the_dynamics():
+    numbers, figure = direct_against_shooting.make(chains=8, iterations=60, grid=(601, 201))
+    for row in numbers["rows"]:
+        assert row["feasible"] == 1.0
+        assert row["upright"] > 0.1
+    assert figure_is_drawn(figure)
 
 
 @pytest.mark.slow

@@ -84,13 +84,13 @@ def test_model_names_joints_and_actuators(cartpole: Solution, tmp_path: Path) ->
 
 
 def test_more_curves_than_colors_are_split() -> None:
-    labels = [f"x[{i}]" for i in range(14)]
+    labels = [f"x{i}" for i in range(14)]
     values = np.arange(14.0) * np.ones((3, 1))
     parts = plotting.Curves("states", labels, values, values, values, values).parts()
     assert len(parts) == 3
     for part in parts:
         assert len(part.labels) <= len(plotting.CURVES)
-        assert part.labels == [f"x[{i:.0f}]" for i in part.plan[0]]
+        assert part.labels == [f"x{i:.0f}" for i in part.plan[0]]
     assert sorted(label for part in parts for label in part.labels) == sorted(labels)
 
 

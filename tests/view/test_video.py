@@ -23,6 +23,7 @@ from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 from mjx_drax.view import renderer, video
+from mjx_drax.view.frames import caption_height
 
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 120, 160
@@ -279,11 +280,32 @@ def test_the_plan_of_any_chain_can_be_filmed(pendulum: Solution, tmp_path: Path)
     lines = video.outcome_lines(failed, 1, plan=True)
     assert lines[1] == "NOT CERTIFIED: the plan is infeasible"
     assert "PLAN of chain 1, not a replay:" in lines
-    assert "breaks the dynamics in x" in " ".join(lines)
+    assert "breaks the dynamics in angle [rad]" in " ".join(lines)
     assert "at knot 2," in " ".join(lines)
     assert "keeps to the dynamics" in video.outcome_lines(failed, 0, plan=True)
     with pytest.raises(DraxError, match=f"chain is 99: give a number below {len(x)}"):
         video.render(failed, path, draw=draw, chain=99)
+
+
+def test_captions_are_under_the_picture_and_can_be_left_out() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
+    )
+    qpos = np.tile(model.qpos0, (3, 1))
+    qpos[:, 0] = [0.0, 1.0, 2.0]  # far, beside its size: the camera goes with it
+    look = {"times": np.arange(3.0), "fps": 1, "size": (160, 120)}
+    plain = video.render_frames(model, qpos, **look)
+    told = video.render_frames(model, qpos, overlay=["a", "t = {time}"], **look)
+    assert plain.shape == told.shape == (3, 120, 160, 3)
+    assert plain[0, 0, 0, 2] > 150  # sky
+    assert (told[0, -1, 0] == [20, 25, 33]).all()
+    np.testing.assert_allclose(plain[0].astype(int), plain[2].astype(int), atol=40)
+    free = video.render_frames(model, qpos, camera="free", **look).astype(int)
+    assert np.abs(free[0] - free[2]).max() > 40
+    arrow = video.render_frames(
+        model, qpos, arrows=lambda time: [(np.zeros(3), np.array([0.3, 0, 0.3]))], **look
+    )
+    assert (arrow[0, ..., 0].astype(int) - arrow[0, ..., 2] > 60).any()  # red
 
 
 def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) -> None:
@@ -295,7 +317,7 @@ def test_uncertified_films_look_different(pendulum: Solution, tmp_path: Path) ->
         path = tmp_path / f"{success}.mp4"
         video.render(judged, path, fps=2, size=(320, 240), draw=_draw_angle)
         first.append(_decoded(path, 240, 320)[0])
-    good, bad = (frame[:60].astype(int) for frame in first)
+    good, bad = (frame[-60:].astype(int) for frame in first)  # the caption
     assert np.sum(bad[..., 0] > bad[..., 1] + 60) > 2000  # red
     assert np.sum(good[..., 0] > good[..., 1] + 60) == 0
 
@@ -313,19 +335,22 @@ def test_a_function_without_draw_has_no_film(pendulum: Solution, tmp_path: Path)
 def test_overlay_is_drawn_and_tells_the_time(backend: str) -> None:
     model, poses, times = _model("pendulum"), [[0.0], [0.0]], [0.0, 1.0]
     plain = video.render_frames(model, poses, times, fps=2)
-    lines = video.render_frames(model, poses, times, fps=2, overlay=("cost 1.0", "t = {time}"))
-    changed = np.argwhere(np.any(plain[0] != lines[0], axis=-1))
-    assert len(changed) > 1000
-    assert changed.max(axis=0)[0] < plain.shape[1] // 3
-    assert np.any(lines[0] != lines[1])
+    told = ("cost 1.0", "t = {time}")
+    lines = video.render_frames(model, poses, times, fps=2, overlay=told)
+    below = caption_height([told], *plain.shape[1:3])
+    assert 20 < below < 60
+    assert np.any(lines[0, -below:] != lines[1, -below:])
+    pictures = lines[:2, :-below].astype(int)  # free of the text; renderers round differently
+    np.testing.assert_allclose(pictures[0], pictures[1], atol=2)
     np.testing.assert_array_equal(plain[0], plain[1])
 
 
 def test_wide_overlay_shrinks_to_fit(backend: str) -> None:
     lines = ("replayed in MuJoCo C: max|h| 1.0e-06, bound violation 0, reaches the goal",)
     frames = video.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2, overlay=lines)
-    plain = video.render_frames(_model("pendulum"), [[0.0]], [0.0], fps=2)
-    assert not np.any((frames != plain)[:, :, -8:])
+    strip = frames[0, -caption_height([lines], *frames.shape[1:3]) :]
+    assert np.all(strip[:, -8:] == strip[0, -1])
+    assert np.any(strip != strip[0, -1])
 
 
 def test_a_model_without_cameras_is_framed(backend: str) -> None:

@@ -2,7 +2,10 @@
 
     phase_portrait    the pendulum's knots before and after, and its bang-bang controls
     convergence       |h|^2 over the iterations for several penalties mu
+    multipliers       |h|^2 with and without multipliers, over mu
+    theorem_2         mu*, where the flow is stable, and its energy, at the pendulum's optimum
     bug_trap          gradient descent, quasi-Newton and diffusion side by side
+    direct_against_shooting  random states, beside what dynamic programming says is possible
     parallel_table    N pendulums at once: time, and what the time bought
     open_questions    preconditioning, annealing, noise or none, sampled or exact gradients
 
@@ -21,7 +24,16 @@ import os
 from importlib import import_module
 from typing import Any
 
-NAMES = ("phase-portrait", "convergence", "bug-trap", "parallel-table", "open-questions")
+NAMES = (
+    "phase-portrait",
+    "convergence",
+    "multipliers",
+    "theorem-2",
+    "bug-trap",
+    "direct-against-shooting",
+    "parallel-table",
+    "open-questions",
+)
 
 
 def run(
@@ -29,8 +41,11 @@ def run(
     folder: str | os.PathLike[str],
     chains: int | None = None,
     iterations: int | None = None,
+    full: bool = False,
 ) -> dict[str, Any]:
     """Make one of `NAMES`; write NAME.png and NAME.json into a folder.
+
+    Default sizes take at most some ten minutes on two CPU cores; `full` takes those of the paper.
 
     Returns:
         the numbers, with the machine and versions that they were measured with.
@@ -47,8 +62,9 @@ def run(
     target = writable(folder)
     sizes = {"chains": chains, "iterations": iterations}
     given = {key: value for key, value in sizes.items() if value is not None}
-    make = import_module(f"{__name__}.{name.replace('-', '_')}").make
-    numbers, figure = make(**given)
+    module = import_module(f"{__name__}.{name.replace('-', '_')}")
+    whole = getattr(module, "FULL", {}) if full else {}
+    numbers, figure = module.make(**{**whole, **given})
     settings = {label: to_data(solver) for label, solver in numbers["settings"].items()}
     numbers = {"name": name, **numbers, "settings": settings, **machine()}
     save_figure(figure, target / f"{name}.png")

@@ -13,21 +13,39 @@ from mjx_drax.method.langevin import Langevin
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, new_figure, reaching, solve_row
+from mjx_drax.studies.reproduce.output import (
+    Numbers,
+    new_figure,
+    reaching,
+    solve_row,
+    tell,
+)
 from mjx_drax.studies.reproduce.settings import NO_NOISE, with_budget
 from mjx_drax.view.plotting import BLACK, BLUE, GREEN, VERMILLION
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+FULL = {"chains": 256}
+"""Sizes with --full: those of the numbers in docs/paper.md."""
+
+FIRST_ORDER = "gradient descent", "quasi-Newton", "paper's flow"
+
+STYLES: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("infeasible: breaks the dynamics", {"color": "0.3", "lw": 1.0, "ls": ":"}),
+    ("feasible, does not reach the goal", {"color": VERMILLION, "lw": 1.2}),
+    ("feasible, reaches the goal", {"color": BLUE, "lw": 1.2}),
+)
+"""Outcomes of a chain: its label and how its path is drawn."""
+
 
 def make(
-    chains: int = 256, iterations: int | None = None, longer: int = 50
+    chains: int = 32, iterations: int | None = None, longer: int = 50
 ) -> tuple[Numbers, Figure]:
     """The same knots, and the same budget of iterations, for every method.
 
-    First-order methods are shown a second time with `longer` times that budget, because one of
-    their iterations costs less.
+    First-order methods have rows for `longer` times that budget too, because one of their
+    iterations costs less; these are drawn, as the paper draws them.
 
     Args:
         chains: of every method.
@@ -38,38 +56,36 @@ def make(
     budget = iterations or settings.budget_of(settings.TRAP)
     solvers = _methods(budget, longer)
     start = settings.initial_knots(problem, chains)
-    columns = -(-len(solvers) // 2)
-    figure = new_figure(2.6 * columns, 6.8)
-    panels = figure.subplots(2, columns, sharex=True, sharey=True).ravel()
-    rows = []
-    for axes, (name, solver) in zip(panels, solvers.items(), strict=False):
-        solution = solve(problem, chains, solver=solver, guess=start)
-        rows.append(solve_row(name, solution))
-        _draw_paths(axes, solution)
-        axes.set_title(f"{name}\n{_outcome(rows[-1])}", loc="left", fontsize=8)
-    for axes in panels[len(solvers) :]:
-        axes.axis("off")
-    for color, label in (
-        (BLUE, "escaped"),
-        (VERMILLION, "feasible, misses the goal"),
-        ("0.7", "infeasible"),
-    ):
-        panels[0].plot([], [], color=color, label=label)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    solutions = {}
+    for name, solver in solvers.items():
+        tell(f"bug-trap: {name}, {settings.budget_of(solver):,} iterations")
+        solutions[name] = solve(problem, chains, solver=solver, guess=start, progress=False)
+    rows = {name: solve_row(name, solution) for name, solution in solutions.items()}
+    figure = new_figure(10.2, 5.0)
+    drawn = [f"{name}, {longer}×" for name in FIRST_ORDER]
+    for i, name in enumerate(drawn):
+        axes = figure.add_subplot(1, len(drawn), i + 1)
+        _draw_paths(axes, solutions[name])
+        axes.set_title(
+            f"({'abc'[i]}) {FIRST_ORDER[i]}\n{_outcome(rows[name])}", loc="left", fontsize=8
+        )
+        if i == 0:
+            for label, style in STYLES:
+                axes.plot([], [], label=label, **style)
+            axes.plot([], [], color=BLACK, lw=2.2, label="the best")
+            axes.set_ylabel("y [m]", fontsize=8)
+            figure.legend(loc="outside lower center", ncols=len(STYLES) + 2, fontsize=8)
     figure.suptitle(
         f"Bug trap, K = {problem.horizon}, {chains} chains from the same knots", fontsize=10
     )
-    return {"rows": rows, "budget": budget, "settings": solvers}, figure
+    return {"rows": list(rows.values()), "budget": budget, "settings": solvers}, figure
 
 
 def _methods(budget: int, longer: int) -> dict[str, Langevin]:
     """The methods that are compared, each with a budget of iterations."""
     flow, diffusion = settings.TRAP_FLOW, with_budget(settings.TRAP, budget)
-    first_order = {
-        "gradient descent": replace(flow, noise=NO_NOISE),
-        "quasi-Newton": settings.TRAP_QUASI_NEWTON,
-        "paper's flow": flow,
-    }
+    solvers = replace(flow, noise=NO_NOISE), settings.TRAP_QUASI_NEWTON, flow
+    first_order = dict(zip(FIRST_ORDER, solvers, strict=True))
     return {
         **{name: with_budget(solver, budget) for name, solver in first_order.items()},
         "preconditioned, no noise": replace(diffusion, noise=NO_NOISE),
@@ -82,25 +98,25 @@ def _methods(budget: int, longer: int) -> dict[str, Langevin]:
 
 
 def _draw_paths(axes: Axes, solution: Solution) -> None:
-    """Paths of all chains over the obstacles."""
+    """Paths of all chains over the obstacles, the best of them thick."""
     task = tasks.load("bug_trap")
     side = np.linspace(-3.0, 3.0, 121)
     grid = np.stack(np.meshgrid(side, side), axis=-1)
     shade = np.exp(-5.0 * np.square(grid[..., None, :] - task.WALL).sum(-1)).sum(-1)
-    axes.contourf(side, side, shade, levels=20, cmap="Greys", vmax=1.6 * shade.max())
-    paths = solution.plans
+    axes.contourf(side, side, shade, levels=20, cmap="Reds", vmax=1.3 * shade.max())
     escaped = reaching(solution)
-    styles: list[tuple[np.ndarray, str, dict[str, Any]]] = [
-        (~solution.feasible, "0.7", {"lw": 0.3, "alpha": 0.4}),
-        (solution.feasible & ~escaped, VERMILLION, {"lw": 0.7, "alpha": 0.5}),
-        (escaped, BLUE, {"lw": 0.7, "alpha": 0.5}),
-    ]
-    for chosen, color, style in styles:
+    paths, feasible = solution.plans, solution.feasible
+    outcomes = ~feasible, feasible & ~escaped, escaped
+    for chosen, (_, style) in zip(outcomes, STYLES, strict=True):
         for path in paths[chosen]:
-            axes.plot(path[:, 0], path[:, 1], color=color, **style)
-    axes.plot(*paths[0, 0, :2], "s", ms=5, color=BLACK)
-    axes.plot(*task.GOAL, "*", ms=13, color=GREEN, mec="white")
+            axes.plot(path[:, 0], path[:, 1], **style)
+    best = paths[solution.best_chain]
+    if feasible.any():
+        axes.plot(best[:, 0], best[:, 1], color=BLACK, lw=2.2, zorder=4)
+    axes.plot(*paths[0, 0, :2], "s", ms=6, color=BLACK, mec="white", zorder=5)
+    axes.plot(*task.GOAL, "*", ms=15, color=GREEN, mec="white", zorder=5, label="goal")
     axes.set(xlim=(-3, 3), ylim=(-3, 3), aspect="equal")
+    axes.set_xlabel("x [m]", fontsize=8)
     axes.tick_params(labelsize=7)
 
 

@@ -20,12 +20,12 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure
+from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
 from mjx_drax.view.plotting import CURVES
 
 
 def make(
-    chains: int = 64,
+    chains: int = 32,
     iterations: int | None = None,
     penalties: Sequence[float] = (0.01, 0.1, 1.0, 10.0, 100.0),
 ) -> tuple[Numbers, Figure]:
@@ -47,9 +47,10 @@ def make(
     axes = figure.subplots()
     rows, series = [], {}
     for mu, color in zip(penalties, CURVES, strict=False):
-        step = min(usual, 0.25 / mu)
+        tell(f"convergence: μ = {mu:g}")
+        step = stable_step(flow, mu)
         solver = replace(flow, penalty=Constant(mu), step_size=step)
-        squares, state = _violations(solver, problem, chains, stops)
+        squares, state = violations(solver, problem, chains, stops)
         low, median, high = np.nanquantile(squares, (0.1, 0.5, 0.9), axis=1)
         defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
         upright = judge(problem, np.asarray(state.trajectory.u, float)).success
@@ -87,7 +88,12 @@ def make(
     }, figure
 
 
-def _violations(
+def stable_step(flow: Langevin, mu: float) -> float:
+    """alpha: the flow's own, and less where a large mu would make it unstable."""
+    return min(float(np.asarray(flow.step_size)), 0.25 / mu)
+
+
+def violations(
     solver: Langevin, problem: Problem, chains: int, stops: np.ndarray
 ) -> tuple[np.ndarray, State]:
     """|h|^2 (stops, chains) after the given numbers of iterations, and the last state."""

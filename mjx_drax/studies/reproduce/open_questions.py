@@ -22,12 +22,21 @@ from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, solve_row
+from mjx_drax.studies.reproduce.output import (
+    Numbers,
+    label_axes,
+    new_figure,
+    solve_row,
+    tell,
+)
 from mjx_drax.studies.reproduce.settings import budget_of, initial_knots, with_budget
 from mjx_drax.view.plotting import BLACK, CURVES, GRAY, SKY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+FULL = {"chains": 256}
+"""Sizes with --full."""
 
 EVERY = 5
 """Iterations between two values of sigma."""
@@ -42,7 +51,7 @@ Rule = Callable[[float, float, np.ndarray], float]
 
 
 def make(
-    chains: int = 256,
+    chains: int = 64,
     iterations: int | None = None,
     limit: int | None = None,
     pairs: Sequence[int] = (2, 3, 4, 16),
@@ -96,6 +105,7 @@ def _compare_metrics(solvers: dict[str, Langevin], chains: int, limit: int) -> l
         budget, median = 0, np.inf
         while median >= FEASIBLE and budget < limit:
             budget = min(max(2 * budget, 20), limit)
+            tell(f"open-questions: {name}, {budget:,} iterations")
             solution = solve(problem, chains, solver=with_budget(solver, budget), guess=knots)
             rows.append(solve_row(name, solution))
             median = rows[-1]["median max|h|"]
@@ -126,6 +136,7 @@ def _compare_annealing(solver: Langevin, chains: int) -> tuple[list[Numbers], di
     problem = tasks.load("bug_trap").make()
     rows, sigmas = [], {}
     for name, rule in RULES.items():
+        tell(f"open-questions: annealing, {name}")
         trajectory, stops, values = _annealed(solver, problem, chains, rule)
         info = evaluate(problem, trajectory)
         feasible = np.asarray(info.max_defect) < FEASIBLE
@@ -175,6 +186,7 @@ def _compare_gradients(chains: int, pairs: Sequence[int]) -> list[Numbers]:
     choices |= {f"{n} pairs a knot": GaussNewton(Smoothed(n)) for n in pairs}
     knots, rows = initial_knots(problem, chains), []
     for name, choice in choices.items():
+        tell(f"open-questions: gradients, {name}")
         solver = replace(settings.PENDULUM, preconditioner=choice)
         rows.append(solve_row(name, solve(problem, chains, solver=solver, guess=knots)))
     return rows

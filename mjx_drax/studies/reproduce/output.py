@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +18,23 @@ if TYPE_CHECKING:
 
 Numbers = dict[str, Any]
 
-SHARES = ("feasible", "reaches goal", "with feedback", "escapes", "diverged", "rollout upright")
+SHARES = (
+    "upright",
+    "of those that can",
+    "within 1.2 times dynamic programming",
+    "feasible",
+    "reaches goal",
+    "with feedback",
+    "escapes",
+    "diverged",
+    "rollout upright",
+)
 """Columns that are printed as percentages, besides those about max|h|."""
+
+
+def tell(line: str) -> None:
+    """Say how far a figure is, on standard error, so that tables can be piped."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def reaching(solution: Solution) -> np.ndarray:
@@ -51,7 +68,7 @@ def table(numbers: Mapping[str, Any]) -> str:
             lines = [names, ["---"] * len(names)]
             lines += [[_cell(name, row[name]) for name in names] for row in value]
             parts.append("\n".join(f"| {' | '.join(cells)} |" for cells in lines))
-    return "\n\n".join(parts).replace("max|h|", "max\\|h\\|")
+    return re.sub(r"\|h\|", r"\\|h\\|", "\n\n".join(parts))
 
 
 def _cell(name: str, value: Any) -> str:

@@ -19,11 +19,14 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.studies.many_starts import solve_each
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure
+from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
 from mjx_drax.view.plotting import BLUE, GRAY, VERMILLION
 
 PUBLISHED = {64: 0.68, 256: 0.75, 1024: 1.04, 2048: 1.49, 4096: 2.12, 8192: 3.53, 16384: 7.95}
 """Times [s] that the paper gives for N pendulums, 20,000 iterations, on an RTX 4070."""
+
+FULL = {"sizes": tuple(PUBLISHED)}
+"""Sizes with --full: the paper's."""
 
 STARTS = ("random", "hanging")
 """Initial states of the problems: U(-4, 4)², or all (3.1, 0)."""
@@ -32,7 +35,7 @@ STARTS = ("random", "hanging")
 def make(
     chains: int | None = None,
     iterations: int | None = None,
-    sizes: Sequence[int] = tuple(PUBLISHED),
+    sizes: Sequence[int] = (64, 256),
 ) -> tuple[Numbers, Figure]:
     """Each pendulum from its own random x_init, U(-4, 4)²; then the same with all hanging at rest.
 
@@ -40,7 +43,7 @@ def make(
     programs, from drawing the initial knots to the final ones.
 
     Args:
-        chains: leaves out larger N (for a CPU).
+        chains: leaves out larger N.
         iterations: of the paper's flow; 20,000 by default.
         sizes: values of N.
     """
@@ -48,6 +51,7 @@ def make(
     sizes = [n for n in sizes if chains is None or n <= chains] or [min(sizes)]
     rows, key = [], jax.random.key(0)
     for size, kind in product(sizes, STARTS):
+        tell(f"parallel-table: N = {size}, x_init {kind}")
         starts = jnp.broadcast_to(problem.x_init, (size, 2))
         if kind == "random":
             starts = jax.random.uniform(key, (size, 2), minval=-4.0, maxval=4.0)
@@ -77,12 +81,13 @@ def _draw(rows: Sequence[Numbers], solvers: dict[str, Langevin]) -> Figure:
     left, right = figure.subplots(1, 2, sharex=True)
     left.loglog(*zip(*PUBLISHED.items(), strict=True), "o--", color=GRAY)
     left.lines[-1].set_label("published, 20,000 iterations, RTX 4070")
-    for (name, color, marker), (kind, dashes) in product(
-        zip(solvers, (VERMILLION, BLUE), "s^", strict=True), zip(STARTS, ("--", "-"), strict=True)
+    for (name, color, marker), (kind, (dashes, fill)) in product(
+        zip(solvers, (VERMILLION, BLUE), "s^", strict=True),
+        zip(STARTS, ((":", "none"), ("-", "full")), strict=True),
     ):
         own = [row for row in rows if row["x_init"] == kind]
         sizes = [row["N"] for row in own]
-        style: Any = {"color": color, "marker": marker, "ls": dashes, "ms": 5}
+        style: Any = {"color": color, "marker": marker, "ls": dashes, "ms": 6, "fillstyle": fill}
         if kind == "hanging":
             total = settings.budget_of(solvers[name])
             label = f"{name}, {total:,} iterations, {jax.devices()[0].device_kind}"
@@ -92,5 +97,9 @@ def _draw(rows: Sequence[Numbers], solvers: dict[str, Langevin]) -> Figure:
     right.set_ylim(-0.05, 1.05)
     for axes, label in ((left, "time [s]"), (right, "share whose rollout reaches upright")):
         label_axes(axes, "problems N", label)
+        shown = sorted({*PUBLISHED, *(row["N"] for row in rows)})
+        axes.set_xticks(shown, [f"{n:,}" for n in shown], rotation=45, fontsize=7)
+        axes.set_xticks([], minor=True)
         axes.legend(fontsize=7)
+    figure.suptitle("N pendulums at once: time, and how many end upright", fontsize=10)
     return figure

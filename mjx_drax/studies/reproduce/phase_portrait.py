@@ -15,7 +15,14 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, reaching, solve_row
+from mjx_drax.studies.reproduce.output import (
+    Numbers,
+    label_axes,
+    new_figure,
+    reaching,
+    solve_row,
+    tell,
+)
 from mjx_drax.view.plotting import BLACK, BLUE, GRAY, GREEN, ORANGE
 
 if TYPE_CHECKING:
@@ -35,6 +42,7 @@ def make(chains: int = 64, iterations: int | None = None) -> tuple[Numbers, Figu
     axes = figure.subplots(2, 2, sharex="row", sharey="row", height_ratios=(2, 1))
     rows = []
     for column, (name, solver) in enumerate(solvers.items()):
+        tell(f"phase-portrait: {name}, {settings.budget_of(solver):,} iterations")
         solution = solve(problem, chains, solver=solver, guess=start)
         rows.append(solve_row(name, solution))
         _draw_phase(axes[0, column], problem, jax.tree.map(lambda a: a[0], start), solution)
