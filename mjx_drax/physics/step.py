@@ -1,6 +1,6 @@
 """One step of MJX, with derivatives that hold at rest and in contact.
 
-Five things differ from `mjx.step`. Only the last one changes values:
+Six things differ from `mjx.step`. Only the last two change values:
 
 - Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), with the function s of MJX. Newton's method
@@ -13,6 +13,7 @@ Five things differ from `mjx.step`. Only the last one changes values:
 - Sums along the tree of bodies are computed by `tree`, without a loop over its levels, and the
   inertia M is dense and factorized by `linalg`.
 - Boxes on planes have the contacts of the C engine; see `collision`.
+- The integrator implicitfast has the C engine's derivative of forces by velocities.
 """
 
 from __future__ import annotations
@@ -78,6 +79,8 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
     data = mass_matrix(model, mjx.tendon(model, data))
     data = collision(model, mjx.tendon_armature(model, data))
+    if model.ntendon:
+        data = with_internal(data, M=_common(model, internal(data).M))
     return mjx.transmission(model, mjx.make_constraint(model, data))
 
 
@@ -180,11 +183,58 @@ def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
             return data.qacc
         by_velocity = -jnp.diag(model.dof_damping)
     else:
-        by_velocity = mjx.deriv_smooth_vel(model, data)
-        if by_velocity is None:
-            return data.qacc
+        by_velocity = _by_velocity(model, data)
     M = symmetric(internal(data).M - h * by_velocity)
     return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
+
+
+def _by_velocity(model: mjx.Model, data: mjx.Data) -> Array:
+    """The derivative of smooth forces by velocities (nv, nv) that the C engine takes.
+
+    It has none of actuators whose force is at an end of its range.
+    """
+    off = int(model.opt.disableflags)
+    found = jnp.zeros((model.nv, model.nv), data.qvel.dtype)
+    if model.nu and not off & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        moment = internal(data).actuator_moment
+        found += moment.T @ (_force_slopes(model, data)[:, None] * moment)
+    if not off & mujoco.mjtDisableBit.mjDSBL_DAMPER:
+        found -= jnp.diag(model.dof_damping)
+        if model.ntendon:
+            arms = internal(data).ten_J
+            found -= arms.T @ (model.tendon_damping[:, None] * arms)
+    return _common(model, found)
+
+
+def _common(model: mjx.Model, matrix: Array) -> Array:
+    """The matrix (nv, nv), 0 where two degrees of freedom have no inertia in common.
+
+    The C engine stores no other entries, and so leaves out what couples two trees by a tendon.
+    """
+    common = np.zeros(matrix.shape, bool)
+    common[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
+    return jnp.where(common | common.T, matrix, 0.0)
+
+
+def _force_slopes(model: mjx.Model, data: mjx.Data) -> Array:
+    """The derivative of each actuator's force by its velocity, (nu,).
+
+    Ranges of an actuator's force make it zero; those of tendons and joints do not.
+    """
+    free = model.replace(
+        actuator_forcelimited=np.zeros_like(model.actuator_forcelimited),
+        tendon_actfrclimited=np.zeros_like(model.tendon_actfrclimited),
+    )
+
+    def force(velocity: Array) -> Array:
+        moving = with_internal(data, actuator_velocity=velocity)
+        return mjx.fwd_actuation(free, moving).actuator_force
+
+    velocity = internal(data).actuator_velocity
+    _, slope = jax.jvp(force, (velocity,), (jnp.ones_like(velocity),))
+    low, high = model.actuator_forcerange.T
+    inside = (low < data.actuator_force) & (data.actuator_force < high)
+    return jnp.where(inside | ~model.actuator_forcelimited.astype(bool), slope, 0.0)
 
 
 def _runge_kutta(model: mjx.Model, joints: Joints, x: Array, u: Array) -> Array:
