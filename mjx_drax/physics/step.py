@@ -80,7 +80,7 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mass_matrix(model, mjx.tendon(model, data))
     data = collision(model, mjx.tendon_armature(model, data))
     if model.ntendon:
-        data = with_internal(data, M=_common(model, internal(data).M))
+        data = with_internal(data, M=jnp.where(_in_inertia(model), internal(data).M, 0.0))
     return mjx.transmission(model, mjx.make_constraint(model, data))
 
 
@@ -184,14 +184,18 @@ def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
         by_velocity = -jnp.diag(model.dof_damping)
     else:
         by_velocity = _by_velocity(model, data)
-    M = symmetric(internal(data).M - h * by_velocity)
-    return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
+    factor = cholesky(symmetric(internal(data).M - h * by_velocity))
+    qacc = solve(factor, data.qfrc_smooth + data.qfrc_constraint)
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return qacc
+    return _turning(model, data, factor, qacc)
 
 
 def _by_velocity(model: mjx.Model, data: mjx.Data) -> Array:
     """The derivative of smooth forces by velocities (nv, nv) that the C engine takes.
 
-    It has none of actuators whose force is at an end of its range.
+    It has none of actuators whose force is at an end of its range, no entries between two trees or
+    branches, as where a tendon couples them.
     """
     off = int(model.opt.disableflags)
     found = jnp.zeros((model.nv, model.nv), data.qvel.dtype)
@@ -203,17 +207,52 @@ def _by_velocity(model: mjx.Model, data: mjx.Data) -> Array:
         if model.ntendon:
             arms = internal(data).ten_J
             found -= arms.T @ (model.tendon_damping[:, None] * arms)
-    return _common(model, found)
+    return jnp.where(_in_line(model), found, 0.0)
 
 
-def _common(model: mjx.Model, matrix: Array) -> Array:
-    """The matrix (nv, nv), 0 where two degrees of freedom have no inertia in common.
+def _turning(model: mjx.Model, data: mjx.Data, factor: Array, qacc: Array) -> Array:
+    """`qacc` (nv,), that of free bodies without other joints changed as by implicit bias forces.
 
-    The C engine stores no other entries, and so leaves out what couples two trees by a tendon.
+    The C engine treats the gyroscopic forces of these implicitly, and those of all other bodies
+    not: (S + h B) a = S qacc, with the matrix S that has this factor, and the derivative B of bias
+    forces by velocities. It couples no two bodies.
     """
-    common = np.zeros(matrix.shape, bool)
-    common[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
-    return jnp.where(common | common.T, matrix, 0.0)
+    starts = np.flatnonzero(np.diff(model.dof_treeid, prepend=-1))
+    ends = np.append(starts[1:], model.nv)
+    free = np.isin(starts, model.jnt_dofadr[model.jnt_type == FREE]) & (ends - starts == 6)
+    entries = starts[free][:, None] + np.arange(6)  # (free bodies, 6)
+    if not entries.size:
+        return qacc
+
+    def bias(velocity: Array) -> Array:
+        return rne(model, com_vel(model, data.replace(qvel=velocity))).qfrc_bias
+
+    units = np.zeros((6, model.nv))
+    units[np.arange(6), entries] = 1.0  # of all bodies at once
+    rates = [jax.jvp(bias, (data.qvel,), (jnp.asarray(e, qacc.dtype),))[1] for e in units]
+    change = model.opt.timestep * jnp.stack([solve(factor, rate) for rate in rates], axis=1)
+    wanted = jnp.eye(6) + change[entries]  # (free bodies, 6, 6)
+    both = jnp.concatenate([wanted, qacc[entries][..., None]], axis=2)
+    for i in range(6):  # elimination; the matrix is close to 1, and needs no other pivots
+        row = both[:, i] / both[:, i, i, None]
+        both = (both - both[:, :, i, None] * row[:, None]).at[:, i].set(row)
+    return qacc.at[entries].set(both[:, :, 6])
+
+
+def _in_line(model: mjx.Model) -> np.ndarray:
+    """Of which pairs of degrees of freedom one is above the other in the tree, (nv, nv)."""
+    above = np.eye(model.nv, dtype=bool)
+    for dof, parent in enumerate(model.dof_parentid):
+        if parent >= 0:
+            above[dof] |= above[parent]
+    return above | above.T
+
+
+def _in_inertia(model: mjx.Model) -> np.ndarray:
+    """Entries of M that the C engine stores, (nv, nv): none between the axes of a lone free body."""
+    stored = np.zeros((model.nv, model.nv), bool)
+    stored[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
+    return stored | stored.T
 
 
 def _force_slopes(model: mjx.Model, data: mjx.Data) -> Array:
