@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property, lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
+
+from mjx_drax.base.errors import DraxError, reason
 
 GPU_OPTIONS = {"xla_gpu_experimental_enable_fusion_autotuner": False}
 """XLA would try several ways to compile each fusion, on the GPU: up to two thirds of the time that
@@ -75,6 +78,31 @@ def keep_none() -> None:
     """Keep no programs, for measurements of compile times, unless JAX was told a folder."""
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_enable_compilation_cache", False)
+
+
+@contextmanager
+def said_plainly(name: str) -> Iterator[None]:
+    """What JAX and its compiler raise, as a sentence.
+
+    Raises:
+        DraxError: with the first line of what they said, and what to try.
+    """
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        hint = "with fewer chains"
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            hint += ", on a CPU (JAX_PLATFORMS=cpu), or with another version of jax"
+        raise DraxError(
+            f"JAX failed to compile or run the solve of {name} ({reason(error)}): try {hint}."
+        ) from error
+    except ValueError as error:
+        if isinstance(error, DraxError) or "Cannot lower jaxpr" not in str(error):
+            raise
+        raise DraxError(
+            f"JAX failed to compile the solve of {name} ({reason(error)}): give numbers to jax as "
+            "jnp.asarray(array) inside of functions, or try another version of jax."
+        ) from error
 
 
 class compiled:

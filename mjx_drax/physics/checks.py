@@ -352,14 +352,22 @@ def _examined(
     engine = Engine(model, contacts)
     _require_stable(engine, name, x_init)
     at = samples(engine, x_init, bounded)
+    most = max(engine.active_contacts(x) for x in at.x)
+    lost = kept is not None and most > kept
+    contacts = most if lost else contacts  # an error shall not be that of contacts left out
     errors = compare(model, at, contacts, bounded, derivatives)
     error = float(errors.velocity.max())
-    notes = [
+    notes: list[str | None] = [
         _beyond_limits(model, name, x_init),
         *(f"{name}: {sentence}." for sentence in set_aside(model)),
         _other_physics(model, name, at, contacts),
-        _lost_contacts(model, name, x_init, kept, bounded),
     ]
+    if lost:
+        notes.append(
+            f"{engine.active_contacts(x_init)} contacts of one friction dimension act at the "
+            f"x_init of {name} and up to {most} soon after, of which the plan keeps the nearest "
+            f"{kept}: give contacts={most}."
+        )
     obstacle = None
     if not error <= NOTICEABLE:
         words = (
@@ -429,24 +437,4 @@ def _other_physics(
         f"ls_iterations={opt.ls_iterations}, tolerance={opt.tolerance:g}): velocities after a step "
         f"are up to {error:.1e} off. The plan and the certificate have the solver converge; set "
         f'<option solver="Newton" iterations="100" ls_iterations="50"/> to simulate the same.'
-    )
-
-
-def _lost_contacts(
-    model: mujoco.MjModel, name: str, x_init: np.ndarray, kept: int | None, bounded: np.ndarray
-) -> str | None:
-    """Says where more contacts act than a plan keeps; `kept` are of each friction dimension.
-
-    What is left out has no force in the plan, and the certificate would find that only later.
-    """
-    if kept is None:
-        return None
-    engine = Engine(model)
-    most = max(engine.active_contacts(x) for x in samples(engine, x_init, bounded).x)
-    if most <= kept:
-        return None
-    return (
-        f"{engine.active_contacts(x_init)} contacts of one friction dimension act at the x_init of "
-        f"{name} and up to {most} soon after, of which the plan keeps the nearest {kept}: give "
-        f"contacts={most}."
     )

@@ -249,7 +249,7 @@ def _in_line(model: mjx.Model) -> np.ndarray:
 
 
 def _in_inertia(model: mjx.Model) -> np.ndarray:
-    """Entries of M that the C engine stores, (nv, nv): none between the axes of a lone free body."""
+    """Entries of M that the C engine stores, (nv, nv); not all of a free body's."""
     stored = np.zeros((model.nv, model.nv), bool)
     stored[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
     return stored | stored.T
