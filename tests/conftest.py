@@ -31,6 +31,7 @@ gc.set_threshold(100_000, 20, 100)  # a twentieth of the time went into looking 
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 # Again as configuration, in case a plugin of pytest imported jax before the lines above.
@@ -54,6 +55,22 @@ def few_programs():
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 25_000:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def models_are_trusted(request):
+    """`from_mjcf` compiles a step to compare it with the C engine's: here only in `physics`."""
+    if "physics" in request.path.parts:
+        yield
+        return
+    from mjx_drax.physics.checks import Findings, StepErrors
+
+    def nothing(*_):
+        return Findings(StepErrors(np.zeros(1)), (), None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mjx_drax.physics.mjcf.examine", nothing)
+        yield
 
 
 SLIDER = """

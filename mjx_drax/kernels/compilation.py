@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property, lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,32 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from mjx_drax.base.errors import DraxError, reason
+
 GPU_OPTIONS = {"xla_gpu_experimental_enable_fusion_autotuner": False}
 """XLA would try several ways to compile each fusion, on the GPU: up to two thirds of the time that
 a contact model compiles, and solves are as fast without."""
+
+
+QUICKLY: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
+"""For a CPU's program that runs once: it compiles faster, and runs slower."""
+
+
+def run_once(function: Callable[..., Any], *arguments: Any) -> Any:
+    """function(*arguments), jitted, for a program that runs once: on the CPU if JAX has one."""
+    try:
+        device = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX was told to have none
+        return jax.jit(function)(*arguments)
+    with jax.default_device(device):
+        lowered = jax.jit(function).lower(*jax.device_put(arguments, device))
+        try:
+            program = lowered.compile(
+                compiler_options=QUICKLY | {"xla_cpu_use_fusion_emitters": False}
+            )
+        except jax.errors.JaxRuntimeError:  # jaxlib 0.11 does not know this option
+            program = lowered.compile(compiler_options=QUICKLY)
+        return program(*jax.device_put(arguments, device))
 
 
 @lru_cache
@@ -54,6 +78,31 @@ def keep_none() -> None:
     """Keep no programs, for measurements of compile times, unless JAX was told a folder."""
     if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_enable_compilation_cache", False)
+
+
+@contextmanager
+def said_plainly(name: str) -> Iterator[None]:
+    """What JAX and its compiler raise, as a sentence.
+
+    Raises:
+        DraxError: with the first line of what they said, and what to try.
+    """
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        hint = "with fewer chains"
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            hint += ", on a CPU (JAX_PLATFORMS=cpu), or with another version of jax"
+        raise DraxError(
+            f"JAX failed to compile or run the solve of {name} ({reason(error)}): try {hint}."
+        ) from error
+    except ValueError as error:
+        if isinstance(error, DraxError) or "Cannot lower jaxpr" not in str(error):
+            raise
+        raise DraxError(
+            f"JAX failed to compile the solve of {name} ({reason(error)}): give numbers to jax as "
+            "jnp.asarray(array) inside of functions, or try another version of jax."
+        ) from error
 
 
 class compiled:

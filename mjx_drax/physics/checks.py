@@ -1,15 +1,15 @@
 """Whether a model can be planned with: all that is asked of it before a problem is built.
 
-`checked_start` asks what needs no MJX, and `warn_of_start_beyond_limits` tells what may be a slip;
-`require_traceable` whether MJX can step the model; `require_same_step` and `warn_of_lost_contacts`
-whether its steps are those of MuJoCo's C engine.
+`checked_start` asks what needs no MJX, `require_traceable` whether MJX can step the model, and
+`examine` whether its steps are those of MuJoCo's C engine, and what a user should know besides.
 For this, both engines take one step in float64 from the same states. What differs by more than
-rounding is wrong in every plan, and the certificate would find that only after a solve.
+rounding is wrong in every plan, and the certificate would find that only after a solve. A cause is
+named if the error is there with it and not without it.
 """
 
 from __future__ import annotations
 
-import warnings
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,14 +20,18 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import DraxError, DraxWarning, reason, shown
+from mjx_drax.base.digests import digest
+from mjx_drax.base.errors import DraxError, reason, shown
 from mjx_drax.base.numbers import vector
+from mjx_drax.kernels.compilation import run_once
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics.actuators import control_ranges, disabled
+from mjx_drax.physics.differences import PARTS, Change, differences, disabling, set_aside
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
-from mjx_drax.physics.mjx_model import bounded_joints, differences, free_ranges, put_model
+from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, put_model
 from mjx_drax.physics.pairs import Contacts
+from mjx_drax.physics.source import binary
 from mjx_drax.physics.states import Engine, integrate, quiet, set_state
 
 SINGULAR = 1e-10
@@ -38,6 +42,10 @@ WRONG, NOTICEABLE = 1e-2, 1e-6
 
 MOMENTS = (0.05, 0.2, 0.6)
 """Times [s] of the states that the engines are compared at, along a motion from x_init."""
+
+OTHER = 1e-3
+"""Change of velocities [rad/s, m/s] in one step, by the model's own contact-solver options, above
+which they count as other physics."""
 
 BEYOND = 0.01
 """Share of a joint's range by which x_init may lie beyond it unsaid: limits give way a little."""
@@ -148,8 +156,8 @@ def require_traceable(
         ) from error
 
 
-def warn_of_start_beyond_limits(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> None:
-    """Warn where x_init (nx,) lies outside of the range of a hinge or slide.
+def _beyond_limits(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> str | None:
+    """Says where x_init (nx,) lies outside of the range of a hinge or slide.
 
     It can be planned from, since the limit's force pushes back, but is hardly ever what is meant.
     """
@@ -161,12 +169,32 @@ def warn_of_start_beyond_limits(model: mujoco.MjModel, name: str, x_init: np.nda
         f"{high[j]:.4g} {'rad' if model.jnt_type[j] == HINGE else 'm'}"
         for j in np.flatnonzero(single & (beyond > BEYOND * (high - low)))
     ]
-    if found:
-        warnings.warn(
-            f"x_init of {name} lies outside of the range of joints ({'; '.join(found)}): move it "
-            "inside, or widen the range.",
-            DraxWarning,
-            stacklevel=3,
+    if not found:
+        return None
+    return (
+        f"x_init of {name} lies outside of the range of joints ({'; '.join(found)}): move it "
+        "inside, or widen the range."
+    )
+
+
+def _require_stable(engine: Engine, name: str, x_init: np.ndarray) -> None:
+    """Complain about a timestep at which the C engine itself diverges from x_init (nx,).
+
+    Raises:
+        DraxError: it does so under a constant control, and not with a tenth of the timestep.
+    """
+    timestep, u = engine.model.opt.timestep, np.clip(0.0, *control_ranges(engine.model))
+    steps = max(1, round(MOMENTS[-1] / timestep))
+    if np.isfinite(engine.step(x_init, u, steps)).all():
+        return
+    engine.model.opt.timestep = timestep / 10
+    finer = engine.step(x_init, u, 10 * steps)
+    engine.model.opt.timestep = timestep
+    if np.isfinite(finer).all():
+        raise DraxError(
+            f"{name} diverges in MuJoCo's C engine within {MOMENTS[-1]} s from x_init at control "
+            f"{shown(u.tolist())}, and does not with a tenth of its timestep of {timestep:g} s: "
+            'make it smaller, or set <option integrator="implicitfast"/>.'
         )
 
 
@@ -253,9 +281,9 @@ def compare(
 
         x, u = jnp.asarray(at.x), jnp.asarray(at.u)
         if derivatives:
-            ends, slopes = jax.tree.map(np.asarray, jax.jit(jax.vmap(slope))(x, u))
+            ends, slopes = jax.tree.map(np.asarray, run_once(jax.vmap(slope), x, u))
         else:
-            ends = np.asarray(jax.jit(jax.vmap(reached))(x, u))
+            ends = np.asarray(run_once(jax.vmap(reached), x, u))
     wanted = np.stack([engine.step(*pair) for pair in zip(at.x, at.u, strict=True)])
     velocities = slice(model.nq, model.nq + nv)
     error = np.abs(ends - wanted)[:, velocities].max(axis=1)
@@ -267,65 +295,149 @@ def compare(
     return StepErrors(error, float(off.max() / np.abs(exact[0]).max()))
 
 
-def require_small_error(name: str, error: float, found: list[str], warn: bool = False) -> None:
-    """Refuse a model whose step has an error of velocities above `WRONG`, or warn of a smaller one.
+@dataclass(frozen=True)
+class Findings:
+    """What `examine` found.
 
-    Args:
-        name: of the model.
-        error: of velocities after one step of MJX [rad/s, m/s].
-        found: its `differences`.
-        warn: of errors above `NOTICEABLE`.
-
-    Raises:
-        DraxError: names the differences.
+    Attributes:
+        errors: of one step of MJX.
+        notes: what a user should know, a sentence each.
+        obstacle: why the model cannot be planned with, a sentence; None if it can.
     """
-    words = (
-        f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
-        f"{name}: {'; '.join(found) or 'for no reason that is known'}."
-    )
-    if not error <= WRONG:
-        raise DraxError(words)
-    if warn and error > NOTICEABLE:
-        warnings.warn(words, DraxWarning, stacklevel=4)
+
+    errors: StepErrors
+    notes: tuple[str, ...]
+    obstacle: str | None
 
 
-def require_same_step(
+def examine(
     model: mujoco.MjModel,
     name: str,
     x_init: np.ndarray,
     contacts: Contacts,
     bounded: np.ndarray,
-) -> None:
-    """Refuse or warn of a model that MJX is known to compute differently, if it does so.
+    kept: int | None,
+    derivatives: bool = False,
+) -> Findings:
+    """Compare one step of MJX with one of the C engine, and look for the causes of an error.
 
-    Only models with `differences` are compared, because that compiles their step.
+    What was found is remembered, since the step is compiled for it.
+
+    Args:
+        model: which is not changed.
+        name: what the sentences call it.
+        x_init: (nx,).
+        contacts, bounded: as for `put_model`.
+        kept: contact points of each friction dimension that a plan keeps; None if all.
+        derivatives: whether they are compared too.
 
     Raises:
-        DraxError: velocities after one step differ by more than `WRONG`.
+        DraxError: the C engine itself diverges.
     """
-    found = differences(model, contacts)
-    if found:
-        at = samples(Engine(model, contacts), x_init, bounded)
-        error = float(np.max(compare(model, at, contacts, bounded).velocity))
-        require_small_error(name, error, found, warn=True)
+    asked = (name, x_init.tobytes(), contacts, bounded.tobytes(), kept, derivatives, binary(model))
+    key = digest(repr(asked))
+    if key not in _EXAMINED:
+        _EXAMINED[key] = _examined(model, name, x_init, contacts, bounded, kept, derivatives)
+    return _EXAMINED[key]
 
 
-def warn_of_lost_contacts(
-    model: mujoco.MjModel, name: str, x_init: np.ndarray, kept: int | None, bounded: np.ndarray
-) -> None:
-    """Warn where more contacts act than a plan keeps; `kept` are of each friction dimension.
+_EXAMINED: dict[str, Findings] = {}
 
-    What is left out has no force in the plan, and the certificate would find that only later.
-    """
-    if kept is None:
-        return
-    engine = Engine(model)
-    most = max(engine.active_contacts(x) for x in samples(engine, x_init, bounded).x)
-    if most > kept:
-        warnings.warn(
+
+def _examined(
+    model: mujoco.MjModel,
+    name: str,
+    x_init: np.ndarray,
+    contacts: Contacts,
+    bounded: np.ndarray,
+    kept: int | None,
+    derivatives: bool,
+) -> Findings:
+    engine = Engine(model, contacts)
+    _require_stable(engine, name, x_init)
+    at = samples(engine, x_init, bounded)
+    most = max(engine.active_contacts(x) for x in at.x)
+    lost = kept is not None and most > kept
+    if lost and isinstance(contacts, int):
+        contacts = most  # an error shall not be that of contacts left out
+    errors = compare(model, at, contacts, bounded, derivatives)
+    error = float(errors.velocity.max())
+    notes: list[str | None] = [
+        _beyond_limits(model, name, x_init),
+        *(f"{name}: {sentence}." for sentence in set_aside(model)),
+        _other_physics(model, name, at, contacts),
+    ]
+    if lost:
+        notes.append(
             f"{engine.active_contacts(x_init)} contacts of one friction dimension act at the "
             f"x_init of {name} and up to {most} soon after, of which the plan keeps the nearest "
-            f"{kept}: give contacts={most}.",
-            DraxWarning,
-            stacklevel=3,
+            f"{kept}: give contacts={most}."
         )
+    obstacle = None
+    if not error <= NOTICEABLE:
+        words = (
+            f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
+            f"{name}: {_causes(model, at, contacts, bounded, error)}."
+        )
+        if not error <= WRONG:
+            obstacle = words
+        else:
+            notes.append(words)
+    return Findings(errors, tuple(note for note in notes if note), obstacle)
+
+
+def _causes(
+    model: mujoco.MjModel,
+    at: Samples,
+    contacts: Contacts,
+    bounded: np.ndarray,
+    error: float,
+) -> str:
+    """Why the velocities of a step have an error, as far as comparing without a cause tells."""
+
+    def error_without(*changes: Change) -> float:
+        changed = copy.deepcopy(model)
+        for change in changes:
+            change(changed)
+        return float(compare(changed, at, contacts, bounded).velocity.max())
+
+    known = differences(model, contacts)
+    if known:
+        rest = error_without(*(each.without for each in known))
+        if rest <= max(NOTICEABLE, error / 10):
+            if len(known) == 1:
+                return known[0].sentence
+            alone = [
+                error_without(*(other.without for other in known if other is not each))
+                for each in known
+            ]
+            named = [
+                f"{each.sentence} (alone {own:.1e})"
+                for each, own in zip(known, alone, strict=True)
+                if not own <= max(2 * rest, NOTICEABLE)
+            ]
+            return "; ".join(named or [each.sentence for each in known])
+    for part, flag in PARTS.items():
+        rest = error_without(disabling(flag))
+        if rest <= max(NOTICEABLE, error / 10):
+            return f"the reason is not known; without {part} it is {rest:.1e}"
+    return "the reason is not known"
+
+
+def _other_physics(model: mujoco.MjModel, name: str, at: Samples, contacts: Contacts) -> str | None:
+    """Says where the model's own options for the contact solver give other physics."""
+    own, sound = Engine(model, contacts, as_given=True), Engine(model, contacts)
+    velocities = slice(model.nq, model.nq + model.nv)
+    error = max(
+        float(np.abs(own.step(x, u) - sound.step(x, u))[velocities].max())
+        for x, u in zip(at.x, at.u, strict=True)
+    )
+    if error <= OTHER:
+        return None
+    opt = model.opt
+    return (
+        f"{name} has its contact solver stop early (iterations={opt.iterations}, "
+        f"ls_iterations={opt.ls_iterations}, tolerance={opt.tolerance:g}): velocities after a step "
+        f"are up to {error:.1e} off. The plan and the certificate have the solver converge; set "
+        f'<option solver="Newton" iterations="100" ls_iterations="50"/> to simulate the same.'
+    )

@@ -136,9 +136,9 @@ def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts
     """Distances (4 n,), positions (4 n, 3) and frames (4 n, 3, 3) of contacts of pairs (n, 2)."""
     plane, box = geom.T
     normal = data.geom_xmat[plane][:, None, :, 2]
-    corners = jnp.asarray(CORNERS, normal.dtype)
+    cube = CORNERS.astype(normal.dtype)  # a copy: JAX knows an array by its identity
     from_centre = jnp.sum(
-        data.geom_xmat[box][:, None] * (corners * model.geom_size[box][:, None])[:, :, None],
+        data.geom_xmat[box][:, None] * (cube * model.geom_size[box][:, None])[:, :, None],
         axis=-1,
     )
     corners = data.geom_xpos[box][:, None] + from_centre

@@ -283,7 +283,10 @@ class MjxDynamics(Dynamics):
                     return own
                 return np.where(own == leaf.astype(own.dtype), leaf, own.astype(float))
 
-            return replace(self, model=jax.tree.map(unrounded, self.model, exact))
+            # With the static arrays of `exact`: JAX knows those of this model in float32
+            pairs = zip(jax.tree.leaves(self.model), jax.tree.leaves(exact), strict=True)
+            leaves = [unrounded(*pair) for pair in pairs]
+            return replace(self, model=jax.tree.unflatten(jax.tree.structure(exact), leaves))
 
     def fingerprint(self) -> bytes:
         """The model of the C engine."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import DraxError, require_part, require_positive, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, require_part, require_positive, shown
 from mjx_drax.physics.actuators import inverse_dynamics, middle_control
-from mjx_drax.physics.checks import (
-    checked_start,
-    require_same_step,
-    require_traceable,
-    warn_of_lost_contacts,
-    warn_of_start_beyond_limits,
-)
+from mjx_drax.physics.checks import checked_start, examine, require_traceable
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, Joints
@@ -138,7 +133,8 @@ def from_mjcf(
             function computes something else when it is traced again.
 
     Warns:
-        DraxWarning: MJX computes the model a little differently from the C engine; x_init lies
+        DraxWarning: MJX computes the model a little differently from the C engine; the model's
+            contact solver stops early; numbers that it has for MJX are set aside; x_init lies
             outside of a joint's range; more contacts act at x_init than the plan keeps.
     """
     given = {
@@ -167,7 +163,6 @@ def from_mjcf(
         )
     K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
     x0, bounded = checked_start(mj_model, name, x_init)
-    warn_of_start_beyond_limits(mj_model, name, x0)
     contacts = affordable(mj_model, name, x0, bounded, contacts)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
@@ -176,8 +171,11 @@ def from_mjcf(
     if phases or names:
         dynamics = dynamics.steered(bool(phases), model_numbers, names)
     bounds = _bounds(mj_model, bounded, x_bounds, u_bounds)
-    require_same_step(mj_model, name, x0, contacts, bounded)
-    warn_of_lost_contacts(mj_model, name, x0, kept_contacts(planned), bounded)
+    found = examine(mj_model, name, x0, contacts, bounded, kept_contacts(planned))
+    if found.obstacle:
+        raise DraxError(found.obstacle)
+    for note in found.notes:
+        warnings.warn(note, DraxWarning, stacklevel=2)
     scatter = _scatter(dynamics, bounds, x0, x_scatter, u_scatter)
     near = 0.5 if x_scatter is None else 0.0
     if dynamics.kinked or dynamics.nx != dynamics.ndx:

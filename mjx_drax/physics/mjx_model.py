@@ -3,14 +3,13 @@
 MJX computes the same physics from the same `mujoco.MjModel`, with exceptions. Where an equal model
 exists that MJX supports (another solver, flag or group), it gets that one. What MJX refuses is said
 in an error, with the fix. Some things it computes differently without saying so: `differences`
-names those that a model has. All others are found by the certificate.
+knows those that a model has, and `checks` measures whether they matter.
 """
 
 from __future__ import annotations
 
 import copy
 import warnings
-from typing import Any
 
 import jax
 import numpy as np
@@ -21,11 +20,14 @@ from mjx_drax.physics.actuators import disabled, driven
 from mjx_drax.physics.collision import extended, hulls, make_data, signature
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
-from mjx_drax.physics.pairs import Contacts, Pair, contact_pairs, geom_name, left_out
+from mjx_drax.physics.pairs import Contacts, Pair, geom_name, left_out
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
 _TOUCHED = (mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT)
+NOT_COMPUTED = -1
+"""First integer parameter of a sensor that MJX does not compute, so that no cost reads it."""
+
 _NET_FORCE = 3
 """How contact sensors say reduce="netforce"."""
 
@@ -36,8 +38,8 @@ boxes on the floor have. A step with half as many takes as long."""
 SLIPPERY = 1e-7
 """Friction of contacts that have none; with MuJoCo's least, 1e-5, a velocity was off by 7e-4."""
 
-_LIMIT = "max_contact_points"
-"""The custom number of a model that tells MJX how many contact points to keep."""
+LIMIT, PAIRS = "max_contact_points", "max_geom_pairs"
+"""Custom numbers of a model that tell MJX how many contact points and pairs of geoms to keep."""
 
 
 def put_model(
@@ -94,23 +96,25 @@ def _with_contact_limit(model: mjx.Model, contacts: Contacts) -> mjx.Model:
     """The model, told to keep only the nearest contact points if it has more than it should.
 
     MJX reads how many to keep from a custom number of the model. It is added here, not in the MJCF,
-    because a model may come compiled. MJX's other number, `max_geom_pairs`, is not used: MJX then
-    chooses pairs of geoms by their bounding spheres, before it knows distances, and loses contacts.
+    because a model may come compiled, and those of the model are set aside: they suit whoever wrote
+    it. MJX's other number, `max_geom_pairs`, is not used: MJX then chooses pairs of geoms by their
+    bounding spheres, before it knows distances, and loses contacts.
     """
-    points = (
-        int(contacts)
-        if isinstance(contacts, int | np.integer) and contacts is not True
-        else MOST_CONTACTS
+    none = np.zeros(0, int)
+    model = model.replace(
+        nnumeric=0, numeric_adr=none, name_numericadr=none, numeric_data=np.zeros(0)
     )
+    points = MOST_CONTACTS
+    if isinstance(contacts, int | np.integer) and contacts is not True:
+        points = int(contacts)
     if np.bincount(contact_points(model), minlength=1).max() <= points:
         return model
     return model.replace(
-        nnumeric=model.nnumeric + 1,
-        # MJX takes the i-th entry for the i-th number, though numbers may have several entries
-        numeric_data=np.append(model.numeric_data[model.numeric_adr], points),
-        numeric_adr=np.arange(model.nnumeric + 1),
-        name_numericadr=np.append(model.name_numericadr, len(model.names)),
-        names=model.names + _LIMIT.encode() + b"\0",  # the last of this name counts
+        nnumeric=1,
+        numeric_data=np.array([float(points)]),
+        numeric_adr=np.array([0]),
+        name_numericadr=np.array([len(model.names)]),
+        names=model.names + LIMIT.encode() + b"\0",
     )
 
 
@@ -165,8 +169,9 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
         model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
     model.actuator_gainprm[disabled(model)] = 0.0
     model.actuator_biasprm[disabled(model)] = 0.0
-    # These sensors are named in `differences`
-    model.sensor_type[_unknown_sensors(model)] = int(mujoco.mjtSensor.mjSENS_CLOCK)
+    unknown = unknown_sensors(model)
+    model.sensor_type[unknown] = int(mujoco.mjtSensor.mjSENS_CLOCK)
+    model.sensor_intprm[unknown, 0] = NOT_COMPUTED  # clocks have none
 
 
 def _pairs(model: mujoco.MjModel, without: set[Pair]) -> list[tuple[int, int, int]]:
@@ -199,7 +204,7 @@ def _give_cones(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Non
     model.pair_dim[model.pair_dim == 1] = 3
 
 
-def _unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
+def unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
     """Sensors that MJX does not compute, (nsensor,)."""
     unknown = np.array([int(kind) not in _SENSORS for kind in model.sensor_type], bool)
     between = np.stack([model.sensor_objtype, model.sensor_reftype], axis=1)
@@ -250,7 +255,7 @@ def _not_collided(model: mujoco.MjModel, without: set[Pair]) -> str:
     )
 
 
-_OTHER_CONTACTS = {
+OTHER_CONTACTS = {
     tuple(int(getattr(_GEOM, f"mjGEOM_{kind}")) for kind in pair.split())
     for pair in (
         *("PLANE MESH", "CAPSULE MESH", "BOX MESH", "MESH MESH", "BOX BOX"),
@@ -262,64 +267,6 @@ _OTHER_CONTACTS = {
     )
 }
 """Types of geoms whose contacts MJX computes differently: one-step velocity errors up to 1."""
-
-
-def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[str]:
-    """What MJX computes differently from the C engine in this model, a sentence each.
-
-    Found by comparing one step of both in many models: each changed velocities by 2e-5 to 0.7.
-    """
-    opt, integrators = model.opt, mujoco.mjtIntegrator
-    pulling = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
-    cases: list[tuple[Any, str]] = [
-        (
-            opt.integrator == integrators.mjINT_IMPLICIT,
-            'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
-        ),
-        (
-            opt.integrator == integrators.mjINT_IMPLICITFAST,
-            'integrator "implicitfast" has other derivatives of velocities in MJX: prefer "Euler"',
-        ),
-        (
-            opt.enableflags & _ENABLE.mjENBL_SLEEP,
-            "bodies do not fall asleep: clear the flag sleep",
-        ),
-        (opt.noslip_iterations, "noslip_iterations are not made: set them to 0"),
-        (
-            np.any(model.jnt_stiffnesspoly) or np.any(model.tendon_stiffnesspoly),
-            "polynomial stiffness is left out: use linear springs",
-        ),
-        (
-            np.any(model.dof_dampingpoly) or np.any(model.tendon_dampingpoly),
-            "polynomial damping is left out: use linear dampers",
-        ),
-        (model.actuator_actearly, "early activation (actearly) is left out: set it to false"),
-        (model.actuator_delay, "actuators' delays are left out: remove them"),
-        (model.nplugin, "plugins are left out: remove them"),
-        (
-            np.any(model.actuator_damping) or np.any(model.actuator_armature),
-            "actuators' own damping and armature are left out: give them to the joints",
-        ),
-        (
-            np.isin(model.eq_type, pulling),
-            "connect and weld constraints pull a little differently: prefer joints",
-        ),
-        (model.geom_fluid[:, 0], "the ellipsoid fluid model differs: use the inertia box"),
-    ]
-    found = [text for condition, text in cases if np.any(condition)]
-    found += [
-        f"sensor {model.sensor(i).name!r} is unknown to MJX: do not use it in costs"
-        for i in np.flatnonzero(_unknown_sensors(model))
-    ]
-    pairs = sorted(set(contact_pairs(model)) - left_out(model, contacts))
-    for a, b in pairs:
-        if (int(model.geom_type[a]), int(model.geom_type[b])) in _OTHER_CONTACTS:
-            found.append(
-                f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
-                "differ: use spheres, capsules and planes"
-            )
-            break
-    return found
 
 
 def constraint_rows(model: mjx.Model) -> int:
@@ -334,7 +281,7 @@ def contact_points(model: mjx.Model) -> np.ndarray:
 
 def kept_contacts(model: mjx.Model) -> int | None:
     """How many contact points of each friction dimension a step keeps; None if it keeps all."""
-    i = mjx.name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _LIMIT)
+    i = mjx.name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, LIMIT)
     return int(model.numeric_data[i]) if i >= 0 and model.numeric_data[i] >= 0 else None
 
 

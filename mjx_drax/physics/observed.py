@@ -19,6 +19,7 @@ from jax import Array
 from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.physics._mjx import internal, mjx
 from mjx_drax.physics.joints import BALL, FREE
+from mjx_drax.physics.mjx_model import NOT_COMPUTED
 
 _OWN = {
     "body": ("xpos", "xquat", "xmat", "xipos", "ximat", "cvel", "subtree_com"),
@@ -49,12 +50,14 @@ class Names:
         of: of each kind in the order of `_OWN`: the names of its elements, "" where it has none.
         sensors: (first, one after the last) entry in sensordata, of each sensor.
         positions, velocities: the same in qpos and qvel, of each joint.
+        unknown: sensors that MJX does not compute.
     """
 
     of: tuple[tuple[str, ...], ...]
     sensors: tuple[tuple[int, int], ...]
     positions: tuple[tuple[int, int], ...]
     velocities: tuple[tuple[int, int], ...]
+    unknown: tuple[int, ...]
 
     @classmethod
     def in_model(cls, model: mjx.Model) -> Names:
@@ -74,6 +77,7 @@ class Names:
             spans(model.sensor_adr, model.sensor_dim),
             spans(model.jnt_qposadr, [q for q, _ in widths]),
             spans(model.jnt_dofadr, [v for _, v in widths]),
+            tuple(np.flatnonzero(model.sensor_intprm[:, 0] == NOT_COMPUTED).tolist()),
         )
 
     def index(self, kind: str, name: object) -> int:
@@ -123,6 +127,11 @@ class Element:
         if name == "qpos":
             return values[..., slice(*names.positions[i])]
         if name == "sensordata":
+            if i in names.unknown:
+                raise DraxError(
+                    f"sensor {self.name!r} is of a kind that MJX does not compute: use positions, "
+                    "velocities and forces of bodies, sites and joints instead."
+                )
             return values[..., slice(*names.sensors[i])]
         if name.startswith("q"):
             return values[..., slice(*names.velocities[i])]

@@ -21,6 +21,7 @@ _FOLDER_OF = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "textur
 _FIXES = {
     "'mujocoinclude'": "It is a part that models include: give the model's own file.",
     "Unrecognized XML model type": "Give an MJCF, which begins with <mujoco>, or a URDF.",
+    "mass and inertia of moving bodies": "Give that body a <geom> with mass, or an <inertial>.",
     "Error opening file": "Put that file there, or correct the path, meshdir or texturedir.",
 }
 """What to do about some of MuJoCo's error messages."""

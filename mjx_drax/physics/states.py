@@ -94,12 +94,34 @@ def without(pairs: Collection[Pair]) -> Iterator[None]:
             mujoco.set_mjcb_contactfilter(None)
 
 
-class Engine:
-    """Single steps of the C engine, with constraints solved to rounding."""
+CONVERGED = {"iterations": 200, "ls_iterations": 100, "tolerance": 1e-12, "ls_tolerance": 0.01}
+"""Options at which the C engine's contact solver, Newton's method, ends at the minimum.
 
-    def __init__(self, model: mujoco.MjModel, contacts: Contacts = True) -> None:
-        self.model = copy.deepcopy(model)
-        self.model.opt.tolerance, self.model.opt.iterations = 0.0, 200
+In nine models (humanoids, a dog, walkers, a pushed block) it took at most eleven iterations, and
+velocities were within 3e-13 of those after a thousand."""
+
+
+def converged(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy of the model, whose contact solver converges, whatever the model's own options are."""
+    model = copy.deepcopy(model)
+    for option, value in CONVERGED.items():
+        setattr(model.opt, option, value)
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    return model
+
+
+class Engine:
+    """Single steps of the C engine.
+
+    Attributes:
+        model: which is stepped; contact solvers converge, whatever the options given.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, contacts: Contacts = True, as_given: bool = False
+    ) -> None:
+        """A copy of the model, `as_given` with its own options for the contact solver."""
+        self.model = copy.deepcopy(model) if as_given else converged(model)
         self.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         if not contacts:
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -109,12 +131,14 @@ class Engine:
         self.model.pair_margin[unwanted] = -mujoco.mjMAXVAL
 
     def step(self, x: Floats, u: Floats, steps: int = 1) -> Floats:
-        """The state (nx,) some steps after x (nx,) under u (nu,)."""
+        """The state (nx,) some steps after x (nx,) under u (nu,); NaN if it diverges."""
         data = mujoco.MjData(self.model)
         set_state(self.model, data, x)
         data.ctrl[:] = u
         with quiet(), without(self._without):
             mujoco.mj_step(self.model, data, steps)
+        if data.time < (steps - 0.5) * self.model.opt.timestep:  # MuJoCo has reset it
+            return np.full_like(x, np.nan)
         return np.concatenate([data.qpos, data.qvel, data.act])
 
     def active_contacts(self, x: Floats) -> int:

@@ -1,6 +1,6 @@
 """One step of MJX, with derivatives that hold at rest and in contact.
 
-Five things differ from `mjx.step`. Only the last one changes values:
+Six things differ from `mjx.step`. Only the last two change values:
 
 - Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), with the function s of MJX. Newton's method
@@ -13,6 +13,7 @@ Five things differ from `mjx.step`. Only the last one changes values:
 - Sums along the tree of bodies are computed by `tree`, without a loop over its levels, and the
   inertia M is dense and factorized by `linalg`.
 - Boxes on planes have the contacts of the C engine; see `collision`.
+- The integrator implicitfast has the C engine's derivative of forces by velocities.
 """
 
 from __future__ import annotations
@@ -78,6 +79,8 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
     data = mass_matrix(model, mjx.tendon(model, data))
     data = collision(model, mjx.tendon_armature(model, data))
+    if model.ntendon:
+        data = with_internal(data, M=jnp.where(_in_inertia(model), internal(data).M, 0.0))
     return mjx.transmission(model, mjx.make_constraint(model, data))
 
 
@@ -180,11 +183,97 @@ def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
             return data.qacc
         by_velocity = -jnp.diag(model.dof_damping)
     else:
-        by_velocity = mjx.deriv_smooth_vel(model, data)
-        if by_velocity is None:
-            return data.qacc
-    M = symmetric(internal(data).M - h * by_velocity)
-    return solve(cholesky(M), data.qfrc_smooth + data.qfrc_constraint)
+        by_velocity = _by_velocity(model, data)
+    factor = cholesky(symmetric(internal(data).M - h * by_velocity))
+    qacc = solve(factor, data.qfrc_smooth + data.qfrc_constraint)
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return qacc
+    return _turning(model, data, factor, qacc)
+
+
+def _by_velocity(model: mjx.Model, data: mjx.Data) -> Array:
+    """The derivative of smooth forces by velocities (nv, nv) that the C engine takes.
+
+    It has none of actuators whose force is at an end of its range, no entries between two trees or
+    branches, as where a tendon couples them.
+    """
+    off = int(model.opt.disableflags)
+    found = jnp.zeros((model.nv, model.nv), data.qvel.dtype)
+    if model.nu and not off & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        moment = internal(data).actuator_moment
+        found += moment.T @ (_force_slopes(model, data)[:, None] * moment)
+    if not off & mujoco.mjtDisableBit.mjDSBL_DAMPER:
+        found -= jnp.diag(model.dof_damping)
+        if model.ntendon:
+            arms = internal(data).ten_J
+            found -= arms.T @ (model.tendon_damping[:, None] * arms)
+    return jnp.where(_in_line(model), found, 0.0)
+
+
+def _turning(model: mjx.Model, data: mjx.Data, factor: Array, qacc: Array) -> Array:
+    """`qacc` (nv,), that of free bodies without other joints changed as by implicit bias forces.
+
+    The C engine treats the gyroscopic forces of these implicitly, and those of all other bodies
+    not: (S + h B) a = S qacc, with the matrix S that has this factor, and the derivative B of bias
+    forces by velocities. It couples no two bodies.
+    """
+    starts = np.flatnonzero(np.diff(model.dof_treeid, prepend=-1))
+    ends = np.append(starts[1:], model.nv)
+    free = np.isin(starts, model.jnt_dofadr[model.jnt_type == FREE]) & (ends - starts == 6)
+    entries = starts[free][:, None] + np.arange(6)  # (free bodies, 6)
+    if not entries.size:
+        return qacc
+
+    def bias(velocity: Array) -> Array:
+        return rne(model, com_vel(model, data.replace(qvel=velocity))).qfrc_bias
+
+    units = np.zeros((6, model.nv))
+    units[np.arange(6), entries] = 1.0  # of all bodies at once
+    rates = [jax.jvp(bias, (data.qvel,), (jnp.asarray(e, qacc.dtype),))[1] for e in units]
+    change = model.opt.timestep * jnp.stack([solve(factor, rate) for rate in rates], axis=1)
+    wanted = jnp.eye(6) + change[entries]  # (free bodies, 6, 6)
+    both = jnp.concatenate([wanted, qacc[entries][..., None]], axis=2)
+    for i in range(6):  # elimination; the matrix is close to 1, and needs no other pivots
+        row = both[:, i] / both[:, i, i, None]
+        both = (both - both[:, :, i, None] * row[:, None]).at[:, i].set(row)
+    return qacc.at[entries].set(both[:, :, 6])
+
+
+def _in_line(model: mjx.Model) -> np.ndarray:
+    """Of which pairs of degrees of freedom one is above the other in the tree, (nv, nv)."""
+    above = np.eye(model.nv, dtype=bool)
+    for dof, parent in enumerate(model.dof_parentid):
+        if parent >= 0:
+            above[dof] |= above[parent]
+    return above | above.T
+
+
+def _in_inertia(model: mjx.Model) -> np.ndarray:
+    """Entries of M that the C engine stores, (nv, nv); not all of a free body's."""
+    stored = np.zeros((model.nv, model.nv), bool)
+    stored[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
+    return stored | stored.T
+
+
+def _force_slopes(model: mjx.Model, data: mjx.Data) -> Array:
+    """The derivative of each actuator's force by its velocity, (nu,).
+
+    Ranges of an actuator's force make it zero; those of tendons and joints do not.
+    """
+    free = model.replace(
+        actuator_forcelimited=np.zeros_like(model.actuator_forcelimited),
+        tendon_actfrclimited=np.zeros_like(model.tendon_actfrclimited),
+    )
+
+    def force(velocity: Array) -> Array:
+        moving = with_internal(data, actuator_velocity=velocity)
+        return mjx.fwd_actuation(free, moving).actuator_force
+
+    velocity = internal(data).actuator_velocity
+    _, slope = jax.jvp(force, (velocity,), (jnp.ones_like(velocity),))
+    low, high = model.actuator_forcerange.T
+    inside = (low < data.actuator_force) & (data.actuator_force < high)
+    return jnp.where(inside | ~model.actuator_forcelimited.astype(bool), slope, 0.0)
 
 
 def _runge_kutta(model: mjx.Model, joints: Joints, x: Array, u: Array) -> Array:

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from mjx_drax.physics.engine import Rollout, mujoco
-from mjx_drax.physics.states import Floats, quiet
+from mjx_drax.physics.states import Floats, converged, quiet
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. Threads wait for each other at every knot, which takes longer than
@@ -25,15 +25,16 @@ _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 class Stepper:
     """States (chains, nx) that advance together, `substeps` physics steps for each knot.
 
-    The constraint solver starts without a guess at each knot, so that a state depends on the one
-    before and on the control alone; `mj_step` in a loop starts it from the last knot's forces, and
-    differs by the solver's tolerance. A state that diverges is NaN from then on.
+    The constraint solver converges, whatever the options of the model are; see `CONVERGED`. It
+    starts without a guess at each knot, so that a state depends on the one before and on the
+    control alone. A state that diverges is NaN from then on.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, x: Floats) -> None:
         """Start at states (chains, nx)."""
         chains, nx = x.shape
         self.substeps, self._x = substeps, slice(1, 1 + nx)
+        model = converged(model)
         self._models = [model] * chains
         self._own = False
         self._threads = min(-(-chains // CHAINS_PER_THREAD), os.cpu_count() or 1)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from mjx_drax.base.errors import require_whole
-from mjx_drax.kernels.compilation import keep_programs
+from mjx_drax.kernels.compilation import keep_programs, said_plainly
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
@@ -249,7 +249,7 @@ def solve_batch(
             mesh=mesh_for(size, devices),
             checkpoint=file,
         )
-        with report as search.chunk_done:
+        with report as search.chunk_done, said_plainly("problems"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         return _certified(family, settings, chains, found, interrupted, tolerances)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, require_whole, shown
 from mjx_drax.base.numbers import numbers
-from mjx_drax.kernels.compilation import keep_programs
+from mjx_drax.kernels.compilation import keep_programs, said_plainly
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.build import from_function
 from mjx_drax.problem.problem import Problem, checked
@@ -235,7 +235,7 @@ def minimize(
             mesh=mesh,
             guess=knots,
         )
-        with report as search.progress:
+        with report as search.progress, said_plainly(program.name):
             found = search.run()
         state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
         multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.kernels.compilation import keep_programs
+from mjx_drax.kernels.compilation import keep_programs, said_plainly
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.trajectory import Trajectory
@@ -109,7 +109,7 @@ def solve(
             checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
             recorder=recorder,
         )
-        with report as search.progress:
+        with report as search.progress, said_plainly(problem.name):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         solution = _certified(problem, settings, seed, found, interrupted, tolerances)

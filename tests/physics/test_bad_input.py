@@ -35,7 +35,7 @@ MODELS = [
     ("repeated-name", lambda at: robot(arm('<body name="link"/>')), "repeated name", "link"),
     ("crossed-range", lambda at: robot(arm(actuator=CROSSED)), "range"),
     ("massless", lambda at: robot("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>"),
-     "mass"),
+     "mass", "<inertial>"),
     ("negative-mass", lambda at: robot(arm('<body><geom size="1" mass="-1"/></body>')), "mass"),
     ("bad-size", lambda at: robot(arm('<body><geom size="-1"/></body>')), "size"),
     ("missing-mesh", lambda at: robot(arm(more='<asset><mesh file="gone.obj"/></asset>')),

@@ -11,19 +11,21 @@ import pytest
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.actuators import driven
-from mjx_drax.physics.checks import Samples, compare
+from mjx_drax.physics.checks import Samples, compare, examine
+from mjx_drax.physics.differences import differences, set_aside
 from mjx_drax.physics.mjx_model import (
     MOST_CONTACTS,
     constraint_rows,
     contact_points,
-    differences,
     has_constraints,
     kept_contacts,
     put_model,
 )
+from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.pairs import contact_pairs
 from mjx_drax.physics.states import Engine
-from mjx_drax.physics.step import step
+from mjx_drax.physics.step import data_at, step
+from mjx_drax.physics.stepper import Stepper
 
 CHAIN = """
 <mujoco model="chain">
@@ -88,7 +90,7 @@ def test_what_is_made_supported_steps_like_the_c_engine(parts):
 def test_implicit_becomes_implicitfast_and_is_named():
     model = rigid(option='integrator="implicit"')
     assert put_model(model).opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert any('"implicit" is planned with' in sentence for sentence in differences(model))
+    assert any('"implicit" is planned' in each.sentence for each in differences(model))
 
 
 def test_the_model_is_left_as_it_was():
@@ -253,8 +255,19 @@ def test_what_mjx_fails_in_without_contacts_or_materials_is_stepped(parts):
 )
 def test_contact_sensors_that_mjx_refuses_are_left_out(contact):
     model = chain(more=TOUCH.format(f'contact name="odd" {contact}'))
-    assert differences(model) == ["sensor 'odd' is unknown to MJX: do not use it in costs"]
+    assert set_aside(model) == ["sensor 'odd' is unknown to MJX: a cost cannot read it"]
     assert put_model(model).nsensor == 1
+
+
+def test_a_cost_that_reads_an_unknown_sensor_is_refused():
+    model = rigid(
+        more='<sensor><user name="odd" dim="1"/><jointpos name="fine" joint="one"/></sensor>'
+    )
+    planned = put_model(model)
+    at = Observed.of(planned, data_at(planned, jnp.zeros(4), jnp.zeros(2)))
+    assert at.sensor("fine").data.shape == (1,)
+    with pytest.raises(DraxError, match="'odd' is of a kind that MJX does not compute"):
+        _ = at.sensor("odd").data
 
 
 CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'
@@ -264,8 +277,6 @@ CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equa
     ("parts", "words"),
     [
         ({"option": 'integrator="implicit"'}, 'choose that, or "Euler"'),
-        ({"option": 'integrator="implicitfast"'}, 'prefer "Euler"'),
-        ({"flag": 'sleep="enable"'}, "fall asleep"),
         ({"option": 'noslip_iterations="3"'}, "noslip_iterations"),
         ({"joint": 'springref="0"', "stiff": True}, "polynomial stiffness"),
         ({"damp": True}, "polynomial damping"),
@@ -274,7 +285,6 @@ CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equa
         ({"motor": 'armature="0.1"'}, "own damping and armature"),
         ({"more": CONNECT}, "connect and weld"),
         ({"option": 'density="1"', "links": 'fluidshape="ellipsoid"'}, "ellipsoid fluid"),
-        ({"more": '<sensor><user name="odd" dim="1"/></sensor>'}, "sensor 'odd' is unknown"),
         ({"floor": "cylinder"}, "contacts like that of 'link' with 'floor'"),
         (
             {
@@ -303,7 +313,10 @@ def test_differences_have_a_sentence_each(parts, words):
         model.dof_dampingpoly[0] = 0.1
     found = differences(model)
     assert len(found) == 1, found
-    assert words in found[0]
+    assert words in found[0].sentence
+    found[0].without(model)
+    gone = "connect" in words or "contacts" in words  # these stay, switched off
+    assert gone or not differences(model)
 
 
 def test_contacts_that_are_left_out_do_not_differ():
@@ -346,3 +359,59 @@ def test_models_that_step_too_differently_are_refused_or_warned_of():
         build(motor='armature="0.5"')
     with pytest.warns(DraxWarning, match="own damping and armature"):
         build(motor='armature="0.0001"')
+
+
+def test_causes_are_named_if_the_error_comes_and_goes_with_them():
+    """Delays do nothing in a step from rest controls; the armature makes the error."""
+    model = rigid(motor='armature="0.5"', option='noslip_iterations="3"')
+    assert len(differences(model)) == 2
+    found = examine(model, "chain", STATES.x[0], True, np.zeros(2, bool), None)
+    assert "armature" in found.obstacle
+    assert "noslip" not in found.obstacle
+
+
+CUSTOM = (
+    '<custom><numeric name="max_geom_pairs" data="1"/>'
+    '<numeric name="max_contact_points" data="1"/></custom>'
+)
+
+
+def test_numbers_of_the_model_for_mjx_are_set_aside_and_said():
+    plain, custom = chain(), chain(before=CUSTOM)
+    counts = [contact_points(put_model(model)).tolist() for model in (plain, custom)]
+    assert counts[0] == counts[1]
+    assert len(counts[1]) > 1
+    assert ["max_geom_pairs and max_contact_points" in text for text in set_aside(custom)] == [True]
+    assert set_aside(plain) == []
+
+
+PILE = """
+<mujoco model="pile">
+  <option timestep="0.005" iterations="1" ls_iterations="1"/>
+  <worldbody><geom type="plane" size="1 1 1"/>
+    <body pos="0 0 0.099"><freejoint/><geom size="0.1" mass="1"/></body>
+    <body pos="0.02 0 0.295"><freejoint/><geom size="0.1" mass="1"/><site name="top"/></body>
+  </worldbody>
+  <actuator><general site="top" gear="1 0 0 0 0 0"/></actuator>
+</mujoco>"""
+
+
+def test_contact_solvers_converge_and_options_that_stop_them_are_told():
+    model = mujoco.MjModel.from_xml_string(PILE)
+    x = np.concatenate([model.qpos0, np.full(model.nv, -0.3)])
+    with Stepper(model, 1, x[None]) as stepper:
+        replayed = stepper(np.ones((1, 1)))[0][0]
+    exact = Engine(model).step(x, np.ones(1))
+    assert np.abs(Engine(model, as_given=True).step(x, np.ones(1)) - exact).max() > 0.01
+    np.testing.assert_allclose(replayed, exact, rtol=0, atol=1e-12)
+    found = examine(model, "pile", x, True, np.zeros(2, bool), None)
+    assert found.obstacle is None
+    assert found.errors.velocity.max() < 1e-9
+    assert ["stop early (iterations=1, ls_iterations=1" in note for note in found.notes] == [True]
+
+
+def test_a_timestep_at_which_the_c_engine_diverges_is_refused():
+    stiff = rigid(joint='springref="1"')
+    stiff.jnt_stiffness[0], stiff.opt.timestep = 1e4, 0.02
+    with pytest.raises(DraxError, match=r"diverges .* tenth of its timestep of 0\.02 s"):
+        examine(stiff, "chain", STATES.x[0], True, np.zeros(2, bool), None)

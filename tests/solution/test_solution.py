@@ -485,3 +485,12 @@ def test_functions_may_hold_numpy_arrays(f):
     states, controls = solution.open_loop.states[0], solution.open_loop.controls[0]
     for x, u, reached in zip(states[:-1], controls, states[1:], strict=True):
         np.testing.assert_allclose(reached, f(x, u), rtol=1e-14)
+
+
+def test_what_jax_raises_is_one_sentence(monkeypatch):
+    def fails(self):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory\nmore\nlines")
+
+    monkeypatch.setattr("mjx_drax.search.engine.Search.run", fails)
+    with pytest.raises(DraxError, match=r"solve of .*out of memory\): try with fewer chains\.$"):
+        solve(reach(), 2, progress=False)

@@ -1,0 +1,164 @@
+"""What MJX is known to compute differently from MuJoCo's C engine, or to leave out.
+
+Each difference can be taken out of a model, so that `checks` can measure what it does: it compares
+the engines with it and without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.mjx_model import (
+    LIMIT,
+    OTHER_CONTACTS,
+    PAIRS,
+    unknown_sensors,
+)
+from mjx_drax.physics.pairs import Contacts, contact_pairs, geom_name, left_out
+
+_DISABLE = mujoco.mjtDisableBit
+_PULLING = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
+
+Change = Callable[[mujoco.MjModel], None]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Something in a model.
+
+    Attributes:
+        sentence: what it is, and what to do.
+        without: takes it out of a model, which it changes.
+    """
+
+    sentence: str
+    without: Change
+
+
+def setting(names: str, value: Any, where: Any = ...) -> Change:
+    """Gives arrays of a model, named in one text, another value."""
+
+    def change(model: mujoco.MjModel) -> None:
+        for name in names.split():
+            getattr(model, name)[where] = value
+
+    return change
+
+
+def option(name: str, value: Any) -> Change:
+    """Gives a model another option."""
+    return lambda model: setattr(model.opt, name, value)
+
+
+def disabling(flag: mujoco.mjtDisableBit) -> Change:
+    """Switches something off in a model."""
+
+    def change(model: mujoco.MjModel) -> None:
+        model.opt.disableflags |= int(flag)
+
+    return change
+
+
+def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[Difference]:
+    """What MJX computes differently in this model.
+
+    Found by comparing one step of both engines in many models: each changed velocities by 2e-5 to
+    0.7.
+    """
+    implicit = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    pulling = np.isin(model.eq_type, _PULLING)
+    cases: list[tuple[Any, str, Change]] = [
+        (
+            model.opt.integrator == implicit,
+            'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
+            option("integrator", int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)),
+        ),
+        (
+            model.opt.noslip_iterations,
+            "noslip_iterations are not made: set them to 0",
+            option("noslip_iterations", 0),
+        ),
+        (
+            np.any(model.jnt_stiffnesspoly) or np.any(model.tendon_stiffnesspoly),
+            "polynomial stiffness is left out: use linear springs",
+            setting("jnt_stiffnesspoly tendon_stiffnesspoly", 0.0),
+        ),
+        (
+            np.any(model.dof_dampingpoly) or np.any(model.tendon_dampingpoly),
+            "polynomial damping is left out: use linear dampers",
+            setting("dof_dampingpoly tendon_dampingpoly", 0.0),
+        ),
+        (
+            model.actuator_actearly,
+            "early activation (actearly) is left out: set it to false",
+            setting("actuator_actearly", False),
+        ),
+        (
+            model.actuator_delay,
+            "actuators' delays are left out: remove them",
+            setting("actuator_delay", 0.0),
+        ),
+        (
+            np.any(model.actuator_damping) or np.any(model.actuator_armature),
+            "actuators' own damping and armature are left out: give them to the joints",
+            setting("actuator_damping actuator_armature", 0.0),
+        ),
+        (
+            pulling,
+            "connect and weld constraints pull a little differently: prefer joints",
+            setting("eq_active0", False, pulling),
+        ),
+        (
+            model.geom_fluid[:, 0],
+            "the ellipsoid fluid model differs: use the inertia box",
+            setting("geom_fluid", 0.0),
+        ),
+        (
+            model.nplugin,
+            "plugins are left out: remove them",
+            setting("body_plugin geom_plugin actuator_plugin sensor_plugin", -1),
+        ),
+    ]
+    found = [Difference(text, without) for condition, text, without in cases if np.any(condition)]
+    for a, b in sorted(set(contact_pairs(model)) - left_out(model, contacts)):
+        if (int(model.geom_type[a]), int(model.geom_type[b])) in OTHER_CONTACTS:
+            sentence = (
+                f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "
+                "differ: use spheres, capsules and planes"
+            )
+            return [*found, Difference(sentence, disabling(_DISABLE.mjDSBL_CONTACT))]
+    return found
+
+
+PARTS = {
+    "contacts": _DISABLE.mjDSBL_CONTACT,
+    "equality constraints": _DISABLE.mjDSBL_EQUALITY,
+    "limits": _DISABLE.mjDSBL_LIMIT,
+    "dry friction": _DISABLE.mjDSBL_FRICTIONLOSS,
+    "actuators": _DISABLE.mjDSBL_ACTUATION,
+}
+"""Parts of a model that can be switched off, where nothing that is known explains an error."""
+
+
+def set_aside(model: mujoco.MjModel) -> list[str]:
+    """What a model asks for and does not get, a sentence each; no step shows it."""
+    found = []
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        found.append("bodies do not fall asleep in a plan: clear the flag sleep")
+    customs = [model.numeric(i).name for i in range(model.nnumeric)]
+    given = " and ".join(name for name in (PAIRS, LIMIT) if name in customs)
+    if given:
+        found.append(
+            f"the model's own {given} for MJX {'are' if ' and ' in given else 'is'} set aside: "
+            "contacts=... says how many contacts a plan keeps"
+        )
+    found += [
+        f"sensor {model.sensor(int(i)).name!r} is unknown to MJX: a cost cannot read it"
+        for i in np.flatnonzero(unknown_sensors(model))
+    ]
+    return found
