@@ -238,8 +238,9 @@ def samples(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int =
     for moment, control in zip(MOMENTS, u[2:], strict=True):
         x.append(engine.step(x_init, control, max(1, round(moment / model.opt.timestep))))
     states, where = np.stack(x), model.jnt_qposadr[bounded]
-    lower, upper = free_ranges(model)
-    states[:, where] = np.clip(states[:, where], lower[bounded], upper[bounded])
+    lower, upper = (end[bounded] for end in free_ranges(model))
+    inside = 1e-6 * (upper - lower)  # at the very end rounding decides whether the limit acts
+    states[:, where] = np.clip(states[:, where], lower + inside, upper - inside)
     usable = np.isfinite(states).all(axis=1)
     return Samples(states[usable], u[usable])
 
@@ -356,6 +357,8 @@ def _examined(
     engine = Engine(model, contacts)
     _require_stable(engine, name, x_init)
     at = samples(engine, x_init, bounded)
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        bounded = np.zeros_like(bounded)  # its stages leave a range that a state is in
     most = max(engine.active_contacts(x) for x in at.x)
     lost = kept is not None and most > kept
     if lost and isinstance(contacts, int):
