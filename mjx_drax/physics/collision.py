@@ -3,6 +3,8 @@
 - Boxes on planes have the contacts of MuJoCo's C engine. MJX makes contacts at the corners of a box
   that are within 1 mm of the lowest one; the C engine takes all corners of the lower half, so that
   a tilted box has more contacts there.
+- Capsules on planes have the C engine's directions of friction, along and across the capsule. MJX
+  has others where a capsule is steeper than 60 degrees.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
   points on them.
 - Two polytopes touch at every point once, where MJX repeats some.
@@ -38,9 +40,9 @@ from mjx_drax.physics._mjx import (
 from mjx_drax.physics.engine import mujoco
 
 _GEOM = mujoco.mjtGeom
-PLANE, HFIELD, ELLIPSOID, CYLINDER, BOX, MESH = (
+PLANE, HFIELD, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(_GEOM, f"mjGEOM_{kind}"))
-    for kind in ("PLANE", "HFIELD", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
+    for kind in ("PLANE", "HFIELD", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
 
 SIDES = 16
@@ -49,6 +51,10 @@ odd multiples of 22.5 degrees, which are corners of it."""
 
 MOST_CORNERS = 20
 """Corners of a face, at most, as in MJX; from larger faces every second or third is taken."""
+
+STEEP, UPRIGHT = 0.1, 1e-6
+"""Cosines of a capsule's angle with a plane: below the first its directions of friction count as
+constant in derivatives, which grow without bound; below the second they are the plane's."""
 
 SAME = 1e-6
 """How close two contacts of one pair are the same one [m]."""
@@ -151,6 +157,28 @@ def plane_box(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts
 
 
 plane_box.ncon = 4  # type: ignore[attr-defined]  # contacts of a pair, which MJX reads
+
+
+def plane_capsule(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts:
+    """The same of capsules, (2 n, ...)."""
+    plane, capsule = geom.T
+    normal, axis = (data.geom_xmat[g][..., 2] for g in (plane, capsule))
+    along = axis - jnp.sum(axis * normal, axis=-1, keepdims=True) * normal
+    square = jnp.sum(along * along, axis=-1, keepdims=True)
+    upright = square < UPRIGHT**2
+    along = jnp.where(upright, jax.vmap(make_frame)(normal)[:, 1], along)
+    along = along * jax.lax.rsqrt(jnp.where(upright, 1.0, square))
+    along = jnp.where(square < STEEP**2, jax.lax.stop_gradient(along), along)
+    frame = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
+    radius, half = model.geom_size[capsule, 0, None], model.geom_size[capsule, 1, None]
+    ends = data.geom_xpos[capsule][:, None] + jnp.stack([half * axis, -half * axis], axis=1)
+    height = jnp.sum((ends - data.geom_xpos[plane][:, None]) * normal[:, None], axis=-1)
+    dist = height - radius
+    pos = ends - (radius + 0.5 * dist)[..., None] * normal[:, None]
+    return dist.reshape(-1), pos.reshape(-1, 3), jnp.repeat(frame, 2, axis=0)
+
+
+plane_capsule.ncon = 2  # type: ignore[attr-defined]
 
 
 def plane_mesh(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
@@ -331,6 +359,7 @@ def _function(collide: Any, contacts: int) -> Any:
 _CYLINDERS, _ELLIPSOIDS = _function(with_corners, 4), _function(with_corners, 1)
 
 _OWN = {
+    (PLANE, CAPSULE): plane_capsule,
     (PLANE, BOX): plane_box,
     (PLANE, MESH): plane_mesh,
     (HFIELD, ELLIPSOID): on_height_field,

@@ -158,6 +158,7 @@ def test_own_model_is_certified_and_written(own, capsys):
     assert (own / "film.gif").read_bytes().startswith(b"GIF")
 
 
+@pytest.mark.slow
 def test_status_is_1_when_not_certified(tmp_path, capsys):
     short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video"
     (tmp_path / "replay.csv").touch()
@@ -291,6 +292,7 @@ def full():
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_gone_on_from(tmp_path, capsys, monkeypatch):
     file = tmp_path / "run.ckpt"
     short = "solve pendulum --horizon 0.5 --chains 2 --iterations 4 --no-video"

@@ -71,6 +71,7 @@ def files_kept(tmp_path, **settings):
     return len(list(folder.iterdir())) if folder.is_dir() else 0
 
 
+@pytest.mark.slow
 def test_programs_are_kept_on_disk_although_some_were_compiled_before(tmp_path):
     assert files_kept(tmp_path) > 0
 

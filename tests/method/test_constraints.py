@@ -246,6 +246,7 @@ def test_a_fixed_end_is_reached_along_the_kkt_trajectory():
 LIMIT = 0.7
 
 
+@pytest.mark.slow
 def test_a_speed_limit_is_kept_and_felt():
     _, x, _ = kkt()
     assert x[:, 1].max() > LIMIT + 0.05  # without it

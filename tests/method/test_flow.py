@@ -194,6 +194,7 @@ def test_the_papers_flow_without_noise_is_primal_dual_descent():
         np.testing.assert_allclose(state.multipliers.dynamics[0].ravel(), multipliers, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preconditioner", "M"),
     [(Identity(), np.eye(len(H))), (GaussNewton(), H + MU * J.T @ J + 0.1 * np.eye(len(H)))],

@@ -105,6 +105,7 @@ def test_clearances_of_meshes_against_the_engine():
     assert box.max() < 1e-5
 
 
+@pytest.mark.slow
 def test_clearances_between_hulls_against_the_engine():
     """Meshes to rounding, apart and not; others are lower bounds by what their hulls leave out."""
     others = ["stone", "can", "egg"]

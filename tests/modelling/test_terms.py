@@ -370,12 +370,13 @@ def test_terms_go_where_functions_go():
 
 def test_the_example_of_the_readme():
     readme = (Path(__file__).parents[2] / "README.md").read_text()
-    code = next(c for c in readme.split("```")[1::2] if "Terms(" in c)
+    code = next(c for c in readme.split("```")[1::2] if "from_mjcf(" in c)
     code = code.removeprefix("python").replace('"robot.xml"', repr(str(path("cartpole"))))
-    code, call = code.split("solution = mjx_drax.solve(problem, chains=64, guess=")
     names = {}
-    exec(code, names)
-    problem, guess = names["problem"], eval(call.strip()[:-1], names)
-    assert guess.x.shape == (64, problem.horizon, 4)
-    close(guess.x[0, 49, :2], [0.5, 1.5])
-    assert (problem.constraint.inequalities, problem.horizon) == (2, 100)
+    exec(code.split("solution = ")[0], names)
+    problem = names["problem"]
+    upright = jnp.array([0.0, np.pi, 0.0, 0.0])
+    assert problem.horizon == 100
+    assert problem.reached(np.asarray(upright))
+    close(problem.terminal_cost(upright), 0.0, 1e-9)
+    close(problem.terminal_cost(upright.at[0].set(0.1)), 0.5)

@@ -92,6 +92,7 @@ def approached(model, count, depth, seed=0):
         yield data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "other", "usual", "worst"),
     [
@@ -148,3 +149,38 @@ def test_hulls_of_meshes_have_no_corner_outside_of_a_face():
         assert (hull.vert @ hull.face_normal.T - inside).max() < 1e-6
         corners, edges = len(hull.vert), len(hull.edge)
         assert edges == hull.edge_face_normal.shape[0] == corners + len(hull.face) - 2
+
+
+CAPSULE = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="3 3 0.1" euler="5 0 0"/>
+    <body><freejoint/><geom type="capsule" size="0.05 0.1" margin="0.02"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def test_capsules_at_any_angle_slide_as_in_the_c_engine():
+    """Directions of friction along and across a capsule; MJX has others where it is steep."""
+    model = mujoco.MjModel.from_xml_string(CAPSULE)
+    wanted, rng, steep = mujoco.MjData(model), np.random.default_rng(0), 0
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for _ in range(40):
+            tilt, turn = rng.uniform(0.0, np.pi / 2), rng.uniform(-np.pi, np.pi)
+            axis = [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)]
+            mujoco.mju_quatZ2Vec(wanted.qpos[3:], np.array(axis))
+            wanted.qpos[:3] = 0, 0, 0.04 + 0.1 * np.cos(tilt)
+            mujoco.mj_forward(model, wanted)
+            found = find(wanted)
+            acting = np.asarray(found.dist) < model.geom_margin.sum()
+            assert acting.sum() == wanted.ncon > 0
+            one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.contact.pos))
+            for name in ("dist", "pos", "frame"):
+                here, there = (getattr(c, name) for c in (found, wanted.contact))
+                there = there[other].reshape(here[acting].shape)
+                np.testing.assert_allclose(here[acting][one], there, atol=1e-12)
+            steep += tilt < np.pi / 6
+        mujoco.mj_resetData(model, wanted)  # upright: any direction is as good, and finite
+        assert np.isfinite(find(wanted).frame).all()
+    assert steep > 5

@@ -58,6 +58,7 @@ def values(data, parts):
     return found
 
 
+@pytest.mark.slow
 def test_elements_have_what_the_c_engine_has_in_the_same_shapes():
     problem = toy()
     x, u = drawn(problem)

@@ -118,6 +118,7 @@ def after(dynamics):
     return np.asarray(dynamics.step(jnp.array([0.3, 0.2]), jnp.array([0.1])))
 
 
+@pytest.mark.slow
 def test_a_number_that_was_zero_is_seen_when_it_changes():
     dynamics = task("pendulum").dynamics
     model = dynamics.model

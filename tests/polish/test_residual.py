@@ -90,6 +90,7 @@ def somewhere(problem, factor=1.0, length=1.0):
     return problem, Trajectory(x, u, slack), lambda_, (forces, replace(forces, slack=none))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [{"factor": 1e6}, {"factor": 1e-6}, {"constant": 1e3}, {"length": 1e3}, {"length": 1e-3}],

@@ -99,6 +99,7 @@ def test_two_phases_each_take_their_least_time():
     np.testing.assert_allclose(found.times[[12, -1]], [2.0, 4.0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_free_start_is_chosen_within_its_bounds():
     problem = double_integrator(
         running_residual=lambda x, u: u,
@@ -153,6 +154,7 @@ def test_a_periodic_motion_is_the_steady_response():
     assert found.certified
 
 
+@pytest.mark.slow
 def test_a_parameter_is_chosen_once():
     problem = from_function(
         lambda x, u, knot: x + DT * knot.parameters["speed"],

@@ -158,7 +158,6 @@ SOLVER = Langevin(
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_pendulum_is_solved_from_function_values_alone():
     problem = from_function(
         pendulum,
@@ -177,6 +176,7 @@ def test_a_pendulum_is_solved_from_function_values_alone():
     np.testing.assert_allclose(found.best.x[-1], [1.0, 0.0], atol=0.1)
 
 
+@pytest.mark.slow
 def test_dynamics_without_a_useful_derivative_are_solved():
     # A push below 1/2 does nothing: from rest, exact derivatives see no reason to push
     def sledge(x, u):

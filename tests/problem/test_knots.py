@@ -38,6 +38,7 @@ def off_track(x, u, knot):
     return jnp.stack([10 * (x[0] - knot.data["p"]), 0.1 * u[0]])
 
 
+@pytest.mark.slow
 def test_a_reference_is_tracked_and_another_one_does_not_compile():
     calls = []
 
@@ -175,6 +176,7 @@ def test_data_move_with_the_horizon_of_a_policy():
     assert max(off[10:]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_saved_solution_loads_with_its_problem(tmp_path):
     problem = double_integrator(running_residual=off_track, data={"p": np.sin(TIMES)})
     found = solve(problem, chains=1)

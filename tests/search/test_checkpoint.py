@@ -143,6 +143,7 @@ def test_killed_at_any_report_it_goes_on_to_the_same_answer(whole, tmp_path):
     assert [f.name for f in file.parent.iterdir()] == ["run.ckpt"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("often")
 def test_a_batch_that_is_killed_goes_on_to_the_same_answer(whole_batch, tmp_path):
     file, seen = tmp_path / "run.ckpt", []
@@ -405,6 +406,7 @@ def test_what_cannot_be_written_is_refused_before_the_solve(call, tmp_path, monk
     assert [f.name for f in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.slow
 def test_the_room_that_is_tried_is_what_is_needed(tmp_path, monkeypatch):
     sizes, allocate = [], os.posix_fallocate
     monkeypatch.setattr(os, "posix_fallocate", lambda *a: (sizes.append(a[-1]), allocate(*a)))

@@ -65,6 +65,7 @@ def swing(weight=1.0):
     )
 
 
+@pytest.mark.slow
 def test_chains_in_the_worse_minimum_are_heated_until_they_leave_it():
     once = minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=1))
     assert 0 < np.mean(once.cost > 2 * once.cost.min()) < 1  # some are trapped
@@ -73,6 +74,7 @@ def test_chains_in_the_worse_minimum_are_heated_until_they_leave_it():
     assert many.cost.min() == pytest.approx(once.cost.min(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_beyond_enough_every_chain_is_tried_again():
     first = search(Restarts(SHORT, attempts=1), chains=6)
     further = search(Restarts(SHORT, attempts=3, enough=2.0), chains=6)
@@ -106,6 +108,7 @@ def test_no_setting_depends_on_the_units_of_the_cost(weight):
     np.testing.assert_allclose(other.cost / weight, usual.cost, rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_attempts_share_one_compilation():
     before = iterate._cache_size()
     found = search(Restarts(SHORT, attempts=3, enough=2.0))
@@ -313,6 +316,7 @@ def test_settings_that_depend_on_the_problem(balls):
     assert found == replace(solver, within=1.0, enough=0.1, heated=False, **rest)
 
 
+@pytest.mark.slow
 def test_no_setting_of_the_users_is_replaced(balls):
     given = {
         "within": 0.5,

@@ -31,6 +31,7 @@ def iterations(found):
     return found.iterations - found.history["noise_ends"][0]
 
 
+@pytest.mark.slow
 def test_the_answer_itself_stays(cold):
     again = solve(limited(), chains=4, guess=cold)
     assert again.optimal_chains.all()

@@ -92,6 +92,7 @@ def test_any_number_of_a_problem_may_differ():
     np.testing.assert_allclose(found.x[2, -1], end, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_finished_problems_leave_the_batch():
     done = []
 
@@ -127,6 +128,7 @@ def test_only_problems_that_are_not_done_are_tried_again():
     np.testing.assert_array_equal(found.u[[0, 2]], others.u[[0, 2]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunks", [1, 2])
 def test_ctrl_c_keeps_what_there_is(whole, chunks):
     done, solved = [], np.arange(5) < 2 * chunks

@@ -130,7 +130,6 @@ def test_a_model_reaches_1e_8(rail, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_batches_reach_1e_8(problem):
     starts = np.array([[0.0, 0.0], [0.1, 0.0]])
     batch = solve_batch(
@@ -142,6 +141,7 @@ def test_batches_reach_1e_8(problem):
     assert_double(batch.x, batch.u, batch.cost)
 
 
+@pytest.mark.slow
 def test_programs_reach_1e_8():
     program = from_program(2, cost=lambda x: (x[0] - 1) ** 2 + 9 * (x[1] - x[0] ** 2) ** 2)
     found = minimize(program, chains=2, solver=ONCE, precision=64)

@@ -98,6 +98,7 @@ def test_without_noise_the_papers_flow_is_the_differential_multiplier_method(lin
         np.testing.assert_allclose(rows, multipliers, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_inequalities_and_bounds_active_and_not():
     # The answer comes first; q is whatever makes it stationary: Qx + q + G'nu - below + above = 0
     x = np.array([0.0, 0.7, 2.0])  # at its lower bound, free, at its upper bound

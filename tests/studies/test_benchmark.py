@@ -209,7 +209,6 @@ def test_random_states_are_the_same_however_many():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_command_writes_a_list_of_rows(tmp_path, capsys, monkeypatch):
     fewer = {"no restarts": Restarts(attempts=1)}
     monkeypatch.setattr(benchmark, "ablations", lambda problem, solver: fewer)
@@ -229,6 +228,7 @@ def test_command_writes_a_list_of_rows(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_suite_of_peers(monkeypatch):
     pytest.importorskip("casadi")
     monkeypatch.setattr(benchmark, "ablations", lambda problem, solver: {})

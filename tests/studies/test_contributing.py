@@ -148,6 +148,7 @@ def test_a_part_is_set_by_name_solves_and_comes_back(mine, name, text, cls, fiel
         assert type(reached(loaded.solver, name)) is type(part)
 
 
+@pytest.mark.slow
 def test_a_solution_says_which_module_it_needs(mine, tmp_path):
     solver = changed(SOLVER, "flow.noise", f"{MODULE}:Cosine(0.1, 0.01)")
     solve(cart(), chains=1, solver=solver).save(tmp_path)
@@ -379,6 +380,7 @@ def test_mpc_turns_through_the_jump(swung):
 # Exporters
 
 
+@pytest.mark.slow
 def test_the_exporter_writes_its_file(mine, tmp_path):
     each = exporter(f"{MODULE}:Text")
     assert type(each) is type(exporter("text")) is type(exporters()["text"]) is mine.Text

@@ -429,6 +429,7 @@ def _run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_importing_changes_nothing() -> None:
     result = _run(
         "import os, sys; before = dict(os.environ)\n"
@@ -441,6 +442,7 @@ def test_importing_changes_nothing() -> None:
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_drawing_leaves_the_environment_alone() -> None:
     result = _run(
         "import os; before = dict(os.environ)\n"
