@@ -76,6 +76,7 @@ def test_programs_are_kept_on_disk_although_some_were_compiled_before(tmp_path):
     assert files_kept(tmp_path) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("setting", "value"),
     [("JAX_ENABLE_COMPILATION_CACHE", "0"), ("JAX_COMPILATION_CACHE_DIR", "{}/other")],
@@ -89,6 +90,7 @@ def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     assert files_kept(tmp_path) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("before", "given", "level"),
     [("", None, "3"), ("", "0", "0"), ("", "1", "1"), ("import jax\n", None, "3")],

@@ -232,6 +232,7 @@ def kkt():
     return u, response @ u, multipliers
 
 
+@pytest.mark.slow
 def test_a_fixed_end_is_reached_along_the_kkt_trajectory():
     u, x, multipliers = kkt()
     found = solve(cart(**FIXED_END), chains=2, solver=Langevin())

@@ -68,6 +68,7 @@ def hull(name):
     return hull_of(MODEL, MODEL.mesh(name).id)
 
 
+@pytest.mark.slow
 def test_clearances_of_meshes_against_the_engine():
     """All pairs at random poses; also in the order of the names, whichever comes first."""
     term, data = ON.clearance(MESHES, OTHERS, margin=0.5), mujoco.MjData(MODEL)
@@ -185,6 +186,7 @@ def test_on_faces_edges_and_corners_derivatives_are_finite_and_lead_out():
         assert both(p + 1e-2 * slope)[0] > value + 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
     [

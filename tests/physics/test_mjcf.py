@@ -109,6 +109,7 @@ def test_step_and_jacobians_are_the_c_engines_in_float64(model):
         np.testing.assert_allclose(AB, c_jacobian(mj_model, x[k], u[k], substeps), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_states_hold_activations():
     task = problem(arm())
     (nx, na), (x, u) = (task.dynamics.nx, task.dynamics.mj_model.na), drawn(task)
@@ -203,6 +204,7 @@ def test_a_model_is_a_file_a_string_or_an_mjmodel():
         assert from_mjcf(model, horizon=0.1, running_residual=effort).name == "pendulum"
 
 
+@pytest.mark.slow
 def test_another_mass_changes_the_motion_without_recompiling():
     model = mujoco.MjModel.from_xml_path(str(path("pendulum")))
     light = problem(model)

@@ -84,6 +84,7 @@ def bare(problem):
     return straight(problem, [1.5, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_a_chain_stays_inside_with_positive_forces_up_to_an_optimum_on_its_bounds():
     problem, polish = swing(), Polish(1e-8, 60)
@@ -101,6 +102,7 @@ def test_a_chain_stays_inside_with_positive_forces_up_to_an_optimum_on_its_bound
     assert np.max(state.trajectory.x[:, 1]) == pytest.approx(1.0, abs=1e-6)  # and a constraint
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("factor", [1e-6, pytest.param(1e6, marks=pytest.mark.slow)])
 def test_the_path_does_not_depend_on_the_units_of_the_cost(factor):
@@ -123,7 +125,9 @@ def test_the_path_does_not_depend_on_the_units_of_the_cost(factor):
     "impossible",
     [
         {"terminal_equality": lambda x: x - jnp.array([9.0, 0.0])},  # out of reach
-        {"inequality": lambda x, u: jnp.stack([u[0] - 0.1, 0.2 - u[0]])},  # each against the other
+        pytest.param(  # each against the other
+            {"inequality": lambda x, u: jnp.stack([u[0] - 0.1, 0.2 - u[0]])}, marks=pytest.mark.slow
+        ),
     ],
     ids=["reach", "opposed"],
 )

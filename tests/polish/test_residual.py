@@ -173,6 +173,7 @@ def nearest(x, slack, force, of_bound):
     return parts_of(program, knots, Multipliers(none, rows), (lower, upper))
 
 
+@pytest.mark.slow
 def test_complementarity_is_a_part_of_its_own():
     """Along u_1 = 1 - force and u_0 = 1.2 - gap slopes balance, and only force slack is left."""
     assert nearest([1.2, 0.8], 0.0, 0.2, 0.6).max() < 1e-15

@@ -202,6 +202,7 @@ def test_the_c_engine_replays_the_changed_model_at_its_own_step():
     assert np.abs(problem.defects(knots)).max() < 1e-5  # f is that of the changed model, too
 
 
+@pytest.mark.slow
 def test_rates_cost_and_are_bounded():
     problem = double_integrator(
         running_residual=lambda x, u, knot: knot.rate,
@@ -246,6 +247,7 @@ def test_jerk_is_the_rate_of_the_rate():
     np.testing.assert_allclose(costs, 0.5 * (rate**2 + jerk**2), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_papers_own_flow_finds_a_start():
     problem = double_integrator(
         running_residual=lambda x, u: jnp.append(u, x[0] - 0.1),

@@ -72,6 +72,7 @@ def test_many_references_in_one_call():
         np.testing.assert_allclose(u, tracking_optimum(np.sin(rate * TIMES)), atol=5e-3)
 
 
+@pytest.mark.slow
 def test_dynamics_that_depend_on_time_replay_in_float64():
     push = np.sin(3 * TIMES[:-1])
 
@@ -110,6 +111,7 @@ def test_the_papers_own_flow_follows_a_reference():
     assert np.mean(other.best.x[:, 0] - found.best.x[:, 0]) > 0.1
 
 
+@pytest.mark.slow
 def test_a_waypoint_at_a_time_and_a_wall_for_a_while():
     way = at_time(lambda x, u: x[:1] - 1.0, 1.0)
     problem = double_integrator(

@@ -240,6 +240,7 @@ def balls():
 NO_ROLLOUTS = Rollouts(first=0, rounds=0)
 
 
+@pytest.mark.slow
 def test_rollouts_follow_where_f_has_kinks(balls):
     """The same dynamics with and without being told of the kink."""
     solver = Restarts(attempts=1, polish=Polish(iterations=0))

@@ -74,6 +74,7 @@ def test_answers_do_not_depend_on_how_the_batch_is_split(whole, near):
     assert abs(alone.cost[0] - whole.cost[3]) < 1e-4  # other random numbers, the same optimum
 
 
+@pytest.mark.slow
 def test_any_number_of_a_problem_may_differ():
     masses, targets = np.array([0.5, 1.0, 2.0]), np.array([[0.2, 0.0], [0.3, 0.1], [-0.2, 0.0]])
 
@@ -180,6 +181,7 @@ PENDULUM = """
 """
 
 
+@pytest.mark.slow
 def test_models_are_replayed_by_the_c_engine():
     swing = from_mjcf(PENDULUM, horizon=0.1, running_residual=lambda data, u: u)
     starts = np.array([[0.3, 0.0], [-0.3, 0.0]])

@@ -69,6 +69,7 @@ def test_a_batch_counts_problems(capsys):
     assert "9/9" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_solve_shows_a_bar_if_asked_and_is_silent_in_a_pipe(capsys):
     once = Restarts(descent=5, attempts=1)
     solve(point(), chains=2, solver=once)

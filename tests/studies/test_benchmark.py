@@ -172,6 +172,7 @@ def test_evaluations_count_linearizations_and_the_ladder():
     assert measure.evaluations(tries, problem, 1, 25) == KNOTS * (25 * linear + 9 * ladder)
 
 
+@pytest.mark.slow
 def test_first_certified_answer_comes_before_the_last_iteration():
     problem = double_integrator()
     solver = Langevin(iterations=5, tail=95, noise=Geometric(0.1, 0.01))

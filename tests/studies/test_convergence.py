@@ -69,6 +69,7 @@ def test_there_are_as_many_problems_as_promised():
     assert len(set(suite.names())) == len(suite.names())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*CASES, "quadrotor", "bug_trap", "hs071"])
 def test_guesses_fit_their_problems(name):
     problem, knots = suite.posed(name)
