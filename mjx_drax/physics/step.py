@@ -29,6 +29,7 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from mjx_drax.kernels.linalg import cholesky, solve, solve_positive, symmetric
+from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
 from mjx_drax.physics.collision import collision, make_data
 from mjx_drax.physics.engine import mujoco
@@ -37,6 +38,7 @@ from mjx_drax.physics.mjx_model import has_constraints
 from mjx_drax.physics.tree import (
     com_pos,
     com_vel,
+    frame_derivatives,
     inverse_derivatives,
     kinematics,
     mass_matrix,
@@ -76,13 +78,13 @@ def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
 
     Compiled functions compute only what their caller reads.
     """
-    data = _smooth(model, data_at(model, x, u))
+    data = _smooth(model, kinematics(model, data_at(model, x, u)))
     data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
     return mjx.sensor_acc(model, _constrained(model, data, _solution(model, data)))
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`data` with all that comes before constraint forces: `qfrc_smooth` is without them."""
+    """`data`, which has frames, with all that comes before constraint forces."""
     turned = np.isin(model.jnt_type, (FREE, BALL))
     if turned.any():
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
@@ -95,8 +97,8 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_position`, with the sums along the tree of `tree`, and without factors of M."""
-    data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
+    """`mjx.fwd_position` from frames on, with the sums of `tree`, and without factors of M."""
+    data = mjx.camlight(model, com_pos(model, data))
     data = mass_matrix(model, mjx.tendon(model, data))
     data = collision(model, mjx.tendon_armature(model, data))
     if model.ntendon:
@@ -201,7 +203,7 @@ def _rates(model: mjx.Model, x: Array, u: Array) -> Array:
 
 def _rates_of(model: mjx.Model, x: Array, u: Array) -> Array:
     """`_rates`, differentiated operation by operation."""
-    data = _smooth(model, data_at(model, x, u))
+    data = _smooth(model, kinematics(model, data_at(model, x, u)))
     data = _constrained(model, data, _solution(model, data))
     return jnp.concatenate([_implicit(model, data), _activation_rates(model, data)])
 
@@ -239,16 +241,14 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     and bias. Those of f are taken apart for positions, velocities, and activations and controls:
     only positions move bodies and contacts.
     """
-    joints, data = Joints.of(model), _smooth(model, data_at(model, x, u))
+    start = kinematics(model, data_at(model, x, u))
+    data = _smooth(model, start)
     found, factor = solution = _solution(model, data)
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
-    def sides(dq: Array, qvel: Array, inputs: Array) -> Array:
-        # Not by `data_at`, whose one array would hand derivatives of each to all others
-        qpos, (act, ctrl) = joints.integrate(data.qpos, dq), jnp.split(inputs, [model.na])
-        at = make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=ctrl)
-        at = _smooth(model, at)
+    def sides(changed: dict[str, Array]) -> Array:
+        at = _smooth(model, start.replace(**changed))
         forces = ConstraintForces.create(model, at.replace(qacc=a), grad=False)
         pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + forces.qfrc_constraint
         left, later = _tendon_bias(model, at, a) - pushed, jnp.zeros(0)
@@ -256,8 +256,15 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
             later = _tendon_inertia_times(model, at, b - a) + _damping_times(model, at, b)
         return jnp.concatenate([left, _activation_rates(model, at), later])
 
-    at = jnp.zeros(model.nv), data.qvel, jnp.concatenate([data.act, u])
-    columns = [jax.jacfwd(sides, argnums=i)(*at) for i in range(3)]
+    def derivatives(directions: dict[str, Array]) -> Array:
+        """Columns of derivatives for directions (n, ...) of some of the data."""
+        at = {name: getattr(start, name) for name in directions}
+        of_one = partial(jax.jvp, pruned(sides), (at,))
+        return jax.vmap(lambda direction: of_one((direction,))[1], out_axes=1)(directions)
+
+    inputs = {"act": model.na, "ctrl": model.nu}
+    columns = [derivatives(frame_derivatives(model, data)), derivatives({"qvel": jnp.eye(model.nv)})]
+    columns += [derivatives({name: jnp.eye(size)}) for name, size in inputs.items() if size]
     ends = [model.nv, model.nv + model.na]
     left, rates, later = jnp.split(jnp.concatenate(columns, axis=1), ends)
     by_q, by_v, more_by_q = inverse_derivatives(model, data, a, b - a)

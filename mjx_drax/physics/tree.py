@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -113,6 +114,42 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         site_xpos=site_xpos,
         site_xmat=site_xmat,
     )
+
+
+def frame_derivatives(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
+    """Derivatives of what `kinematics` finds by each degree of freedom, (nv, ...), by name.
+
+    A degree of freedom moves all frames that it carries as one rigid body, by its motion `cdof`.
+    """
+    sums, bodies, joints = _Sums.of(model), np.arange(model.nbody), Joints.of(model)
+    turning, moving = data.cdof[:, None, :3], data.cdof[:, None, 3:]
+    about = data.subtree_com[model.body_rootid]
+
+    def turned(carried: np.ndarray, vectors: Array) -> Array:
+        """Of vectors (n, 3), of which each is carried or not, (nv, n)."""
+        return carried[:, :, None] * jnp.cross(turning, vectors)
+
+    def of_points(carried: np.ndarray, body: np.ndarray, points: Array) -> Array:
+        return turned(carried, points - about[body]) + carried[:, :, None] * moving
+
+    def of_axes(carried: np.ndarray, axes: Array) -> Array:
+        return jnp.stack([turned(carried, axes[:, :, k]) for k in range(3)], axis=-1)
+
+    ends = np.append(np.asarray(model.jnt_dofadr)[1:], model.nv) - 1
+    before, on = sums.before[ends].T, np.asarray(model.jnt_bodyid)
+    fixed = np.asarray(model.jnt_type)[:, None] == FREE
+    spins = 0.5 * sums.moves.T[:, :, None] * jnp.pad(turning, ((0, 0), (0, 0), (1, 0)))
+    found = {
+        "qpos": jax.jacfwd(lambda dq: joints.integrate(data.qpos, dq))(jnp.zeros(model.nv)).T,
+        "xanchor": of_points(before, on, data.xanchor),
+        "xaxis": jnp.where(fixed, 0.0, turned(before, data.xaxis)),
+        "xquat": multiply(spins, data.xquat),
+    }
+    for name, body in (("x", bodies), ("xi", bodies), ("geom_x", model.geom_bodyid), ("site_x", model.site_bodyid)):
+        carried = sums.moves[np.asarray(body)].T
+        found[f"{name}pos"] = of_points(carried, body, getattr(data, f"{name}pos"))
+        found[f"{name}mat"] = of_axes(carried, getattr(data, f"{name}mat"))
+    return found
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
