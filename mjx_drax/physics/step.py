@@ -139,8 +139,7 @@ def _solution(model: mjx.Model, data: mjx.Data) -> Solution:
     def hessian(qacc: Array) -> Array:
         return symmetric(jax.jacfwd(lambda a: law(a)[0])(qacc))
 
-    found = _minimum(law, hessian, jax.lax.stop_gradient(data.qacc_smooth))
-    return found, cholesky(hessian(found))
+    return _minimum(law, hessian, jax.lax.stop_gradient(data.qacc_smooth))
 
 
 def _constrained(model: mjx.Model, data: mjx.Data, solution: Solution) -> mjx.Data:
@@ -158,17 +157,20 @@ def _minimum(
     law: Callable[[Array], tuple[Array, ConstraintForces]],
     hessian: Callable[[Array], Array],
     start: Array,
-) -> Array:
-    """The acceleration (nv,) where the gradient of `law` is zero, to rounding, by Newton's method.
+) -> tuple[Array, Array]:
+    """Where the gradient of `law` is zero, to rounding, by Newton's method.
 
-    The function is piecewise quadratic where friction cones are pyramids. Once the constraints that
-    are active stay the same, a full step ends at the minimum; before, a shorter one may be better.
+    Returns that acceleration (nv,) and the factor of the Hessian there: the last iteration, which
+    finds no better one, has made it. The function is piecewise quadratic where friction cones are
+    pyramids. Once the constraints that are active stay the same, a full step ends at the minimum;
+    before, a shorter one may be better.
     """
     sizes = 0.5 ** jnp.arange(SIZES)
 
     def newton(carry: Any) -> Any:
-        count, _, qacc, gradient, cost = carry
-        direction = solve(cholesky(hessian(qacc)), gradient)
+        count, _, _, qacc, gradient, cost = carry
+        factor = cholesky(hessian(qacc))
+        direction = solve(factor, gradient)
         tries = qacc - sizes[:, None] * direction
         gradients, forces = jax.vmap(law)(tries)
         best = jnp.argmin(forces.cost)
@@ -177,12 +179,13 @@ def _minimum(
         better = cost - forces.cost[best] > least
         found = tries[best], gradients[best], forces.cost[best]
         kept = jax.tree.map(partial(jnp.where, better), found, (qacc, gradient, cost))
-        return count + 1, better, *kept
+        return count + 1, better, factor, *kept
 
     gradient, forces = law(start)
-    begin = jnp.array(0), jnp.array(True), start, gradient, forces.cost
+    none = jnp.zeros((len(start), len(start)), start.dtype)
+    begin = jnp.array(0), jnp.array(True), none, start, gradient, forces.cost
     end: Any = jax.lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], newton, begin)
-    return end[2]
+    return end[3], end[2]
 
 
 def step(model: mjx.Model, x: Array, u: Array) -> Array:
@@ -247,6 +250,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
+    @pruned
     def sides(changed: dict[str, Array]) -> Array:
         at = _smooth(model, start.replace(**changed))
         forces = ConstraintForces.create(model, at.replace(qacc=a), grad=False)
@@ -259,16 +263,21 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     def derivatives(directions: dict[str, Array]) -> Array:
         """Columns of derivatives for directions (n, ...) of some of the data."""
         at = {name: getattr(start, name) for name in directions}
-        of_one = partial(jax.jvp, pruned(sides), (at,))
-        return jax.vmap(lambda direction: of_one((direction,))[1], out_axes=1)(directions)
 
-    inputs = {"act": model.na, "ctrl": model.nu}
-    columns = [derivatives(frame_derivatives(model, data)), derivatives({"qvel": jnp.eye(model.nv)})]
-    columns += [derivatives({name: jnp.eye(size)}) for name, size in inputs.items() if size]
+        def of_one(direction: dict[str, Array]) -> Array:
+            return jax.jvp(lambda part: sides(whole | part), (at,), (direction,))[1]
+
+        return jax.vmap(of_one, out_axes=1)(directions)
+
+    by_q = frame_derivatives(model, data)
+    sizes = {"qvel": model.nv, "act": model.na, "ctrl": model.nu}
+    whole = {name: getattr(start, name) for name in (*by_q, *sizes)}
+    columns = [derivatives(by_q)]
+    columns += [derivatives({name: jnp.eye(size)}) for name, size in sizes.items() if size]
     ends = [model.nv, model.nv + model.na]
     left, rates, later = jnp.split(jnp.concatenate(columns, axis=1), ends)
-    by_q, by_v, more_by_q = inverse_derivatives(model, data, a, b - a)
-    left = left.at[:, : 2 * model.nv].add(jnp.concatenate([by_q, by_v], axis=1))
+    bias_by_q, bias_by_v, more_by_q = inverse_derivatives(model, data, a, b - a)
+    left = left.at[:, : 2 * model.nv].add(jnp.concatenate([bias_by_q, bias_by_v], axis=1))
     d = -solve(factor, left)
     if not explicit:
         later = later.at[:, : model.nv].add(more_by_q)
