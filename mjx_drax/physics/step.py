@@ -28,6 +28,13 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
+from mjx_drax.kernels.constraint_solver import (
+    ITERATIONS,
+    LEAST_SHARE,
+    SIZES,
+    Constraints,
+    constrained_minimum,
+)
 from mjx_drax.kernels.linalg import cholesky, solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
@@ -44,14 +51,6 @@ from mjx_drax.physics.tree import (
     mass_matrix,
     rne,
 )
-
-ITERATIONS, SIZES = 20, 8
-"""Newton's method for constraint forces: most iterations, and how many step sizes it chooses from,
-1, 1/2, 1/4, ..."""
-
-LEAST_SHARE = 1e-3
-"""Least share of its predicted decrease that a step must achieve for another one to follow. In
-float32, or where constraints are about to switch, costs go on decreasing by almost nothing."""
 
 RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 """Of each stage: the share of the timestep that it goes along the rate of the stage before, and its
@@ -134,12 +133,19 @@ def _solution(model: mjx.Model, data: mjx.Data) -> Solution:
     """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
     if internal(data).efc_J.size == 0:
         return None
-    law = partial(_law, *jax.lax.stop_gradient((model, data)))
+    model, data = jax.lax.stop_gradient((model, data))
+    if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        rows = internal(data)
+        both = np.arange(len(rows.efc_D)) < rows.ne + rows.nf
+        of_rows = rows.efc_D, rows.efc_aref, rows.efc_frictionloss, both.astype(data.qvel.dtype)
+        start = data.qfrc_smooth, data.qacc_smooth
+        return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, *start))
+    law = partial(_law, model, data)
 
     def hessian(qacc: Array) -> Array:
         return symmetric(jax.jacfwd(lambda a: law(a)[0])(qacc))
 
-    return _minimum(law, hessian, jax.lax.stop_gradient(data.qacc_smooth))
+    return _minimum(law, hessian, data.qacc_smooth)
 
 
 def _constrained(model: mjx.Model, data: mjx.Data, solution: Solution) -> mjx.Data:
