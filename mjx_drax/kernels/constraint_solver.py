@@ -96,20 +96,28 @@ def iterated(
 
     def iteration(carry: Any) -> Any:
         count, _, *here, cost, _ = carry
-        off, rest, y = here
+        _, rest, y = here
         _, push, slope = law(given, y)
         gradient = rest - transposed_times(J, push)
         direction, left = newton(M + product((J * slope[:, None]).T, J), gradient)
         along = direction, times(M, direction), times(J, direction)
         # Changes are added up: values from anew differ by rounding, which could look like progress
-        costs = total(*(a[None] - sizes[:, None] * d[None] for a, d in zip(here, along, strict=True)))
+        costs = total(
+            *(a[None] - sizes[:, None] * d[None] for a, d in zip(here, along, strict=True))
+        )
         lowest = jnp.min(costs)
         size = jnp.max(jnp.where(costs == lowest, sizes, 0.0))
         rounding = jnp.finfo(cost.dtype).eps * jnp.abs(cost)
         least = jnp.maximum(rounding, LEAST_SHARE * jnp.sum(gradient * direction))
         better = cost - lowest > least
         size, cost = jnp.where(better, size, 0.0), jnp.where(better, lowest, cost)
-        return count + 1, better, *(a - size * d for a, d in zip(here, along, strict=True)), cost, left
+        return (
+            count + 1,
+            better,
+            *(a - size * d for a, d in zip(here, along, strict=True)),
+            cost,
+            left,
+        )
 
     here = jnp.zeros_like(a0), times(M, a0) - force, times(J, a0) - given.aref
     begin = 0, True, *here, jnp.sum(total(*(a[None] for a in here))), left
@@ -155,7 +163,7 @@ def minima(given: Constraints, interpret: bool = False) -> Array:
     """The accelerations (rows, nv) by the kernel; every array leads with the axis of rows."""
     m, n = given.J.shape[-2:]
     M, N = tile(m), tile(n)
-    shapes = Constraints((N, N), (M, N), (M,), (M,), (M,), (M,), (N,), (N,))
+    shapes = (N, N), (M, N), (M,), (M,), (M,), (M,), (N,), (N,)
     arrays = [padded(a, *shape) for a, shape in zip(given, shapes, strict=True)]
     precision = lax.Precision.HIGHEST if interpret else SPLIT
     body = partial(_body, n, partial(product, precision=precision))

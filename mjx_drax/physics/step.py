@@ -57,10 +57,6 @@ RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 weight in the sum of rates."""
 
 
-Solution = tuple[Array, Array] | None
-"""Of `_solution`; None where the model has no constraints."""
-
-
 def state(data: mjx.Data) -> Array:
     """x = [qpos, qvel, act], (nx,)."""
     return jnp.concatenate([data.qpos, data.qvel, data.act])
@@ -79,7 +75,7 @@ def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
     """
     data = _smooth(model, kinematics(model, data_at(model, x, u)))
     data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
-    return mjx.sensor_acc(model, _constrained(model, data, _solution(model, data)))
+    return mjx.sensor_acc(model, _constrained(model, data))
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -129,10 +125,8 @@ def _law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Constrai
     return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
 
-def _solution(model: mjx.Model, data: mjx.Data) -> Solution:
+def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
     """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
-    if internal(data).efc_J.size == 0:
-        return None
     model, data = jax.lax.stop_gradient((model, data))
     if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
         rows = internal(data)
@@ -148,11 +142,13 @@ def _solution(model: mjx.Model, data: mjx.Data) -> Solution:
     return _minimum(law, hessian, data.qacc_smooth)
 
 
-def _constrained(model: mjx.Model, data: mjx.Data, solution: Solution) -> mjx.Data:
+def _constrained(
+    model: mjx.Model, data: mjx.Data, solution: tuple[Array, Array] | None = None
+) -> mjx.Data:
     """`data` with the acceleration and the forces under constraints, and with derivatives."""
-    if solution is None:
+    if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
-    found, factor = solution
+    found, factor = solution or _solution(model, data)
     qacc = found - solve(factor, _law(model, data, found)[0])
     _, forces = _law(model, data, qacc)
     data = data.replace(qacc=qacc, qfrc_constraint=forces.Ma - data.qfrc_smooth)
@@ -213,7 +209,7 @@ def _rates(model: mjx.Model, x: Array, u: Array) -> Array:
 def _rates_of(model: mjx.Model, x: Array, u: Array) -> Array:
     """`_rates`, differentiated operation by operation."""
     data = _smooth(model, kinematics(model, data_at(model, x, u)))
-    data = _constrained(model, data, _solution(model, data))
+    data = _constrained(model, data)
     return jnp.concatenate([_implicit(model, data), _activation_rates(model, data)])
 
 
@@ -252,7 +248,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     """
     start = kinematics(model, data_at(model, x, u))
     data = _smooth(model, start)
-    found, factor = solution = _solution(model, data)
+    solution = _solution(model, data)
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
@@ -261,7 +257,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
         at = _smooth(model, start.replace(**changed))
         forces = ConstraintForces.create(model, at.replace(qacc=a), grad=False)
         pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + forces.qfrc_constraint
-        left, later = _tendon_bias(model, at, a) - pushed, jnp.zeros(0)
+        left, later = _tendon_bias(model, at, a) - pushed, data.qvel[:0]
         if not explicit:
             later = _tendon_inertia_times(model, at, b - a) + _damping_times(model, at, b)
         return jnp.concatenate([left, _activation_rates(model, at), later])
@@ -279,12 +275,14 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     sizes = {"qvel": model.nv, "act": model.na, "ctrl": model.nu}
     whole = {name: getattr(start, name) for name in (*by_q, *sizes)}
     columns = [derivatives(by_q)]
-    columns += [derivatives({name: jnp.eye(size)}) for name, size in sizes.items() if size]
+    columns += [
+        derivatives({name: jnp.eye(size, dtype=a.dtype)}) for name, size in sizes.items() if size
+    ]
     ends = [model.nv, model.nv + model.na]
     left, rates, later = jnp.split(jnp.concatenate(columns, axis=1), ends)
     bias_by_q, bias_by_v, more_by_q = inverse_derivatives(model, data, a, b - a)
     left = left.at[:, : 2 * model.nv].add(jnp.concatenate([bias_by_q, bias_by_v], axis=1))
-    d = -solve(factor, left)
+    d = -solve(solution[1], left)
     if not explicit:
         later = later.at[:, : model.nv].add(more_by_q)
         d = _solve_implicit(model, data, internal(data).M @ d - later)

@@ -122,31 +122,38 @@ def frame_derivatives(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
     A degree of freedom moves all frames that it carries as one rigid body, by its motion `cdof`.
     """
     sums, bodies, joints = _Sums.of(model), np.arange(model.nbody), Joints.of(model)
+    moves = sums.moves > 0
     turning, moving = data.cdof[:, None, :3], data.cdof[:, None, 3:]
     about = data.subtree_com[model.body_rootid]
 
     def turned(carried: np.ndarray, vectors: Array) -> Array:
         """Of vectors (n, 3), of which each is carried or not, (nv, n)."""
-        return carried[:, :, None] * jnp.cross(turning, vectors)
+        return jnp.where(carried[:, :, None], jnp.cross(turning, vectors), 0.0)
 
     def of_points(carried: np.ndarray, body: np.ndarray, points: Array) -> Array:
-        return turned(carried, points - about[body]) + carried[:, :, None] * moving
+        return turned(carried, points - about[body]) + jnp.where(carried[:, :, None], moving, 0.0)
 
     def of_axes(carried: np.ndarray, axes: Array) -> Array:
         return jnp.stack([turned(carried, axes[:, :, k]) for k in range(3)], axis=-1)
 
     ends = np.append(np.asarray(model.jnt_dofadr)[1:], model.nv) - 1
-    before, on = sums.before[ends].T, np.asarray(model.jnt_bodyid)
+    before, on = sums.before[ends].T > 0, np.asarray(model.jnt_bodyid)
     fixed = np.asarray(model.jnt_type)[:, None] == FREE
-    spins = 0.5 * sums.moves.T[:, :, None] * jnp.pad(turning, ((0, 0), (0, 0), (1, 0)))
+    spin = 0.5 * jnp.pad(turning, ((0, 0), (0, 0), (1, 0)))
+    still = jnp.zeros(model.nv, data.qpos.dtype)
     found = {
-        "qpos": jax.jacfwd(lambda dq: joints.integrate(data.qpos, dq))(jnp.zeros(model.nv)).T,
+        "qpos": jax.jacfwd(lambda dq: joints.integrate(data.qpos, dq))(still).T,
         "xanchor": of_points(before, on, data.xanchor),
         "xaxis": jnp.where(fixed, 0.0, turned(before, data.xaxis)),
-        "xquat": multiply(spins, data.xquat),
+        "xquat": multiply(jnp.where(moves.T[:, :, None], spin, 0.0), data.xquat),
     }
-    for name, body in (("x", bodies), ("xi", bodies), ("geom_x", model.geom_bodyid), ("site_x", model.site_bodyid)):
-        carried = sums.moves[np.asarray(body)].T
+    for name, body in (
+        ("x", bodies),
+        ("xi", bodies),
+        ("geom_x", model.geom_bodyid),
+        ("site_x", model.site_bodyid),
+    ):
+        carried = moves[np.asarray(body)].T
         found[f"{name}pos"] = of_points(carried, body, getattr(data, f"{name}pos"))
         found[f"{name}mat"] = of_axes(carried, getattr(data, f"{name}mat"))
     return found
@@ -255,7 +262,8 @@ def inverse_derivatives(
         own = jnp.sum(slopes * first[:, :, None], axis=1) + _inertia_times(inertias, second)
         own = own + _crossed_force(S, _summed(moves.T, force))
         by_above = jnp.sum(swept[:, None] * first + moved[:, None] * second, axis=2)
-        return above * by_above + before.T * jnp.sum(S[:, None] * own, axis=2)
+        by_below = jnp.sum(S[:, None] * own, axis=2)
+        return jnp.where(above > 0, by_above, 0.0) + jnp.where(before.T > 0, by_below, 0.0)
 
     rate, speed = data.cdof_dot, data.qvel[:, None]
     world = jnp.zeros(6, S.dtype)
@@ -271,7 +279,9 @@ def inverse_derivatives(
     return (
         derivative(rate, second, force),
         derivative(S, rate + behind, jnp.zeros_like(force)),
-        derivative(none, _crossed(_summed(before, push), S), _inertia_times(inertia, _summed(moves, push))),
+        derivative(
+            none, _crossed(_summed(before, push), S), _inertia_times(inertia, _summed(moves, push))
+        ),
     )
 
 
