@@ -6,6 +6,7 @@ Six things differ from `mjx.step`. Only the last two change values:
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), with the function s of MJX. Newton's method
   finds the minimum a* without derivatives. One more Newton step, a* - H^{-1} grad(a*), has them:
   where grad = 0 its derivative is that of the implicit function theorem, da = -H^{-1} d grad.
+  A whole step has that derivative at once, with all parts in closed form that have one.
 - Positions are integrated by `joints`, whose quaternions have derivatives at rest. The
   semi-implicit integrators end with this, so only their end is replaced; Runge-Kutta integrates at
   every stage and is written here.
@@ -218,6 +219,10 @@ _with_own_derivative = jax.custom_jvp(_rates_of)
 
 @partial(_with_own_derivative.defjvp, symbolic_zeros=True)
 def _rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """Where numbers of the model change too, by the operations; else by `_derivatives`.
+
+    What depends on no tangent is computed once for all of them, and so is the Jacobian.
+    """
     (model, x, u), (of_model, *of_rest) = primals, tangents
     if all(isinstance(d, SymbolicZero) for d in jax.tree.leaves(of_model)):
         rates, jacobian = _derivatives(model, x, u)
