@@ -124,3 +124,40 @@ def thread_for_each_row(
         compiler_params=CompilerParams(num_warps=threads // 32, num_stages=1),
         interpret=interpret,
     )(*arrays, *common)
+
+
+def block_for_each_row(
+    body: Callable[..., None],
+    shapes: dict[str, tuple[int, ...]],
+    arrays: Sequence[Array],
+    warps: int,
+    interpret: bool = False,
+) -> dict[str, Array]:
+    """One GPU kernel for all rows, with a block of threads for each; rows are the first axis.
+
+    Args:
+        body: body(*arrays, *results), which reads and writes references of one row, (1, ...).
+        shapes: of the results, (rows, ...), by name.
+        arrays: of shapes (rows, ...); entries of rows are powers of two.
+        warps: how many groups of 32 threads work on a row.
+        interpret: run it without a GPU.
+
+    Returns:
+        what the body writes, by name.
+    """
+    from jax.experimental import pallas as pl  # only here: it takes a second
+    from jax.experimental.pallas.triton import CompilerParams
+
+    def of_row(shape: tuple[int, ...]) -> pl.BlockSpec:
+        return pl.BlockSpec((1, *shape[1:]), lambda i: (i, *[0] * (len(shape) - 1)))
+
+    out = pl.pallas_call(
+        body,
+        grid=(arrays[0].shape[0],),
+        in_specs=[of_row(a.shape) for a in arrays],
+        out_specs=[of_row(s) for s in shapes.values()],
+        out_shape=[jax.ShapeDtypeStruct(s, arrays[0].dtype) for s in shapes.values()],
+        compiler_params=CompilerParams(num_warps=warps, num_stages=1),
+        interpret=interpret,
+    )(*arrays)
+    return dict(zip(shapes, out, strict=True))

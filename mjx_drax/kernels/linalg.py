@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from functools import partial
 from operator import truediv
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -112,6 +113,30 @@ def solve_upper(factor: Array, b: Array) -> Array:
 def solve(factor: Array, b: Array) -> Array:
     """(L L')^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
     return solve_upper(factor, solve_lower(factor, b))
+
+
+def solve_positive(matrix: Array, b: Array) -> Array:
+    """M^{-1} b for a positive definite M (n, n) and b (n,) or (n, m).
+
+    Above `UNROLLED_UP_TO` derivatives are those of the equation M y = b, not of the operations of
+    its factorization.
+    """
+    if matrix.shape[-1] <= UNROLLED_UP_TO:
+        return solve(cholesky(matrix), b)
+    return _solve_positive(matrix, b)
+
+
+@jax.custom_jvp
+def _solve_positive(matrix: Array, b: Array) -> Array:
+    return solve(cholesky(matrix), b)
+
+
+@_solve_positive.defjvp
+def _solve_positive_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> Any:
+    (matrix, b), (dM, db) = primals, tangents
+    factor = cholesky(matrix)
+    y = solve(factor, b)
+    return y, solve(factor, db - dM @ y)
 
 
 def transposed_product(J: Array, A: Array) -> Array:

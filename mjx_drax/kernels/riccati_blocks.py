@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mjx_drax.kernels.batching import block_for_each_row
 from mjx_drax.kernels.linalg import cholesky, solve_upper
 
 LEAST, MAX_NDX, MAX_NU = 16, 64, 32
@@ -58,7 +59,8 @@ def newton_steps(
     h, gx, multipliers = (padded(a, N) for a in (h, gx, multipliers))
 
     def launch(body: Any, shapes: dict[str, tuple[int, ...]], *arrays: Array) -> dict[str, Array]:
-        return _launch(body, {k: (chains, K, *s) for k, s in shapes.items()}, arrays, interpret)
+        full = {k: (chains, K, *s) for k, s in shapes.items()}
+        return block_for_each_row(body, full, arrays, WARPS, interpret)
 
     exact = partial(product, precision=lax.Precision.HIGHEST if interpret else SPLIT)
     shapes = {"K": (M, N), "kff": (M,), "Q": (M, M), "T": (N, N), "P": (N, N), "p": (N,)}
@@ -198,25 +200,3 @@ def padded(a: Array, *sizes: int) -> Array:
     lead = a.ndim - len(sizes)
     more = [size - there for size, there in zip(sizes, a.shape[lead:], strict=True)]
     return jnp.pad(a, [(0, 0)] * lead + [(0, by) for by in more])
-
-
-def _launch(
-    body: Any, shapes: dict[str, tuple[int, ...]], arrays: tuple[Array, ...], interpret: bool
-) -> dict[str, Array]:
-    """What the body writes, by name; the first axis of all arrays is that of chains."""
-    from jax.experimental import pallas as pl  # only here: it takes a second
-    from jax.experimental.pallas.triton import CompilerParams
-
-    def of_chain(shape: tuple[int, ...]) -> pl.BlockSpec:
-        return pl.BlockSpec((1, *shape[1:]), lambda i: (i, *[0] * (len(shape) - 1)))
-
-    out = pl.pallas_call(
-        body,
-        grid=(arrays[0].shape[0],),
-        in_specs=[of_chain(a.shape) for a in arrays],
-        out_specs=[of_chain(s) for s in shapes.values()],
-        out_shape=[jax.ShapeDtypeStruct(s, arrays[1].dtype) for s in shapes.values()],
-        compiler_params=CompilerParams(num_warps=WARPS, num_stages=1),
-        interpret=interpret,
-    )(*arrays)
-    return dict(zip(shapes, out, strict=True))

@@ -6,6 +6,7 @@ Six things differ from `mjx.step`. Only the last two change values:
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), with the function s of MJX. Newton's method
   finds the minimum a* without derivatives. One more Newton step, a* - H^{-1} grad(a*), has them:
   where grad = 0 its derivative is that of the implicit function theorem, da = -H^{-1} d grad.
+  A whole step has that derivative at once, with all parts in closed form that have one.
 - Positions are integrated by `joints`, whose quaternions have derivatives at rest. The
   semi-implicit integrators end with this, so only their end is replaced; Runge-Kutta integrates at
   every stage and is written here.
@@ -26,21 +27,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 
-from mjx_drax.kernels.linalg import cholesky, solve, symmetric
+from mjx_drax.kernels.constraint_solver import (
+    ITERATIONS,
+    LEAST_SHARE,
+    SIZES,
+    Constraints,
+    constrained_minimum,
+)
+from mjx_drax.kernels.linalg import cholesky, solve, solve_positive, symmetric
+from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
 from mjx_drax.physics.collision import collision, make_data
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import BALL, FREE, Joints
-from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
-
-ITERATIONS, SIZES = 20, 8
-"""Newton's method for constraint forces: most iterations, and how many step sizes it chooses from,
-1, 1/2, 1/4, ..."""
-
-LEAST_SHARE = 1e-3
-"""Least share of its predicted decrease that a step must achieve for another one to follow. In
-float32, or where constraints are about to switch, costs go on decreasing by almost nothing."""
+from mjx_drax.physics.mjx_model import has_constraints
+from mjx_drax.physics.tree import (
+    com_pos,
+    com_vel,
+    frame_derivatives,
+    inverse_derivatives,
+    kinematics,
+    mass_matrix,
+    rne,
+)
 
 RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 """Of each stage: the share of the timestep that it goes along the rate of the stage before, and its
@@ -63,20 +74,27 @@ def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
 
     Compiled functions compute only what their caller reads.
     """
-    data = data_at(model, x, u)
+    data = _smooth(model, kinematics(model, data_at(model, x, u)))
+    data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
+    return mjx.sensor_acc(model, _constrained(model, data))
+
+
+def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`data`, which has frames, with all that comes before constraint forces."""
     turned = np.isin(model.jnt_type, (FREE, BALL))
     if turned.any():
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
         model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
-    data = mjx.sensor_pos(model, _at_positions(model, data))
-    data = mjx.sensor_vel(model, _at_velocities(model, data))
-    data = _accelerated(model, mjx.fwd_actuation(model, data))
-    return mjx.sensor_acc(model, _constrained(model, data))
+    data = _at_velocities(model, _at_positions(model, data))
+    data = mjx.fwd_actuation(model, data)
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + data.qfrc_applied
+    qacc = solve_positive(internal(data).M, force)
+    return data.replace(qfrc_smooth=force, qacc_smooth=qacc)
 
 
 def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_position`, with the sums along the tree of `tree`, and without factors of M."""
-    data = mjx.camlight(model, com_pos(model, kinematics(model, data)))
+    """`mjx.fwd_position` from frames on, with the sums of `tree`, and without factors of M."""
+    data = mjx.camlight(model, com_pos(model, data))
     data = mass_matrix(model, mjx.tendon(model, data))
     data = collision(model, mjx.tendon_armature(model, data))
     if model.ntendon:
@@ -95,14 +113,6 @@ def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return mjx.tendon_bias(model, data)
 
 
-def _accelerated(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_acceleration`: `data` with the acceleration without constraints."""
-    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
-    force = force + data.qfrc_applied + mjx.xfrc_accumulate(model, data)
-    qacc = solve(cholesky(internal(data).M), force)
-    return data.replace(qfrc_smooth=force, qacc_smooth=qacc)
-
-
 def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
     """Forces (nv,) of the springs of ball and free joints, where `turned` is true, (njnt,)."""
     away = Joints.of(model).difference(qpos, model.qpos_spring)
@@ -110,25 +120,38 @@ def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
     return -stiffness[model.dof_jntid] * away
 
 
-def _constrained(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`data` with the acceleration and the forces under constraints."""
-    if internal(data).efc_J.size == 0:
-        return data.replace(qacc=data.qacc_smooth)
+def _law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, ConstraintForces]:
+    """The gradient (nv,) of what the acceleration minimizes, and constraint forces."""
+    forces = ConstraintForces.create(model, data.replace(qacc=qacc), grad=False)
+    return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
-    def law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, ConstraintForces]:
-        """The gradient (nv,) of what the acceleration minimizes, and constraint forces."""
-        forces = ConstraintForces.create(model, data.replace(qacc=qacc), grad=False)
-        return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
 
-    given = model, data
-    frozen = jax.lax.stop_gradient(given)
+def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
+    """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
+    model, data = jax.lax.stop_gradient((model, data))
+    if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        rows = internal(data)
+        both = np.arange(len(rows.efc_D)) < rows.ne + rows.nf
+        of_rows = rows.efc_D, rows.efc_aref, rows.efc_frictionloss, both.astype(data.qvel.dtype)
+        start = data.qfrc_smooth, data.qacc_smooth
+        return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, *start))
+    law = partial(_law, model, data)
 
     def hessian(qacc: Array) -> Array:
-        return symmetric(jax.jacfwd(lambda a: law(*frozen, a)[0])(qacc))
+        return symmetric(jax.jacfwd(lambda a: law(a)[0])(qacc))
 
-    found = _minimum(partial(law, *frozen), hessian, frozen[1].qacc_smooth)
-    qacc = found - solve(cholesky(hessian(found)), law(*given, found)[0])
-    _, forces = law(*given, qacc)
+    return _minimum(law, hessian, data.qacc_smooth)
+
+
+def _constrained(
+    model: mjx.Model, data: mjx.Data, solution: tuple[Array, Array] | None = None
+) -> mjx.Data:
+    """`data` with the acceleration and the forces under constraints, and with derivatives."""
+    if internal(data).efc_J.size == 0:
+        return data.replace(qacc=data.qacc_smooth)
+    found, factor = solution or _solution(model, data)
+    qacc = found - solve(factor, _law(model, data, found)[0])
+    _, forces = _law(model, data, qacc)
     data = data.replace(qacc=qacc, qfrc_constraint=forces.Ma - data.qfrc_smooth)
     return with_internal(data, efc_force=forces.efc_force)
 
@@ -137,17 +160,20 @@ def _minimum(
     law: Callable[[Array], tuple[Array, ConstraintForces]],
     hessian: Callable[[Array], Array],
     start: Array,
-) -> Array:
-    """The acceleration (nv,) where the gradient of `law` is zero, to rounding, by Newton's method.
+) -> tuple[Array, Array]:
+    """Where the gradient of `law` is zero, to rounding, by Newton's method.
 
-    The function is piecewise quadratic where friction cones are pyramids. Once the constraints that
-    are active stay the same, a full step ends at the minimum; before, a shorter one may be better.
+    Returns that acceleration (nv,) and the factor of the Hessian there: the last iteration, which
+    finds no better one, has made it. The function is piecewise quadratic where friction cones are
+    pyramids. Once the constraints that are active stay the same, a full step ends at the minimum;
+    before, a shorter one may be better.
     """
     sizes = 0.5 ** jnp.arange(SIZES)
 
     def newton(carry: Any) -> Any:
-        count, _, qacc, gradient, cost = carry
-        direction = solve(cholesky(hessian(qacc)), gradient)
+        count, _, _, qacc, gradient, cost = carry
+        factor = cholesky(hessian(qacc))
+        direction = solve(factor, gradient)
         tries = qacc - sizes[:, None] * direction
         gradients, forces = jax.vmap(law)(tries)
         best = jnp.argmin(forces.cost)
@@ -156,12 +182,13 @@ def _minimum(
         better = cost - forces.cost[best] > least
         found = tries[best], gradients[best], forces.cost[best]
         kept = jax.tree.map(partial(jnp.where, better), found, (qacc, gradient, cost))
-        return count + 1, better, *kept
+        return count + 1, better, factor, *kept
 
     gradient, forces = law(start)
-    begin = jnp.array(0), jnp.array(True), start, gradient, forces.cost
+    none = jnp.zeros((len(start), len(start)), start.dtype)
+    begin = jnp.array(0), jnp.array(True), none, start, gradient, forces.cost
     end: Any = jax.lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], newton, begin)
-    return end[2]
+    return end[3], end[2]
 
 
 def step(model: mjx.Model, x: Array, u: Array) -> Array:
@@ -169,34 +196,192 @@ def step(model: mjx.Model, x: Array, u: Array) -> Array:
     joints, h = Joints.of(model), model.opt.timestep
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return _runge_kutta(model, joints, x, u)
-    data = forward(model, x, u)
-    dv = h * _implicit(model, data)
-    act = mjx.euler(model, data).act if model.na else data.act
-    return joints.integrate(x, jnp.concatenate([h * (data.qvel + dv), dv, act - data.act]))
+    qacc, change = jnp.split(_rates(model, x, u), [model.nv])
+    dv = h * qacc
+    velocity = x[model.nq : model.nq + model.nv] + dv
+    return joints.integrate(x, jnp.concatenate([h * velocity, dv, change]))
+
+
+def _rates(model: mjx.Model, x: Array, u: Array) -> Array:
+    """The acceleration that is integrated (nv,), and rates of activations; see `_derivatives`."""
+    return (_with_own_derivative if has_constraints(model) else _rates_of)(model, x, u)
+
+
+def _rates_of(model: mjx.Model, x: Array, u: Array) -> Array:
+    """`_rates`, differentiated operation by operation."""
+    data = _smooth(model, kinematics(model, data_at(model, x, u)))
+    data = _constrained(model, data)
+    return jnp.concatenate([_implicit(model, data), _activation_rates(model, data)])
+
+
+_with_own_derivative = jax.custom_jvp(_rates_of)
+
+
+@partial(_with_own_derivative.defjvp, symbolic_zeros=True)
+def _rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """Where numbers of the model change too, by the operations; else by `_derivatives`.
+
+    What depends on no tangent is computed once for all of them, and so is the Jacobian.
+    """
+    (model, x, u), (of_model, *of_rest) = primals, tangents
+    if all(isinstance(d, SymbolicZero) for d in jax.tree.leaves(of_model)):
+        rates, jacobian = _derivatives(model, x, u)
+        dx, du = map(_as_array, of_rest)
+        _, dx = jax.jvp(lambda y: Joints.of(model).difference(y, x), (x,), (dx,))
+        return rates, jacobian @ jnp.concatenate([dx, du])
+    return jax.jvp(_rates_of, primals, jax.tree.map(_as_array, tangents))
+
+
+def _as_array(tangent: Any) -> Any:
+    if isinstance(tangent, SymbolicZero):
+        return np.zeros(tangent.shape, tangent.dtype)
+    return tangent
+
+
+def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
+    """`_rates` (nv + na,) and their Jacobian in the tangent space, (nv + na, ndx + nu).
+
+    The acceleration a, and the one that is integrated, b, obey
+
+        M a + bias - f = 0        f: all other forces, those of constraints for a
+        W b - M a = 0             see `_implicit`
+
+    By the implicit function theorem, with derivatives of the left sides at fixed a and b,
+    H da = -d(M a + bias - f) and W db = M da - d(W b - M a). `inverse_derivatives` has those of M
+    and bias. Those of f are taken apart for positions, velocities, and activations and controls:
+    only positions move bodies and contacts.
+    """
+    start = kinematics(model, data_at(model, x, u))
+    data = _smooth(model, start)
+    solution = _solution(model, data)
+    data = _constrained(model, data, solution)
+    a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
+
+    @pruned
+    def sides(changed: dict[str, Array]) -> Array:
+        at = _smooth(model, start.replace(**changed))
+        forces = ConstraintForces.create(model, at.replace(qacc=a), grad=False)
+        pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + forces.qfrc_constraint
+        left, later = _tendon_bias(model, at, a) - pushed, data.qvel[:0]
+        if not explicit:
+            later = _tendon_inertia_times(model, at, b - a) + _damping_times(model, at, b)
+        return jnp.concatenate([left, _activation_rates(model, at), later])
+
+    def derivatives(directions: dict[str, Array]) -> Array:
+        """Columns of derivatives for directions (n, ...) of some of the data."""
+        at = {name: getattr(start, name) for name in directions}
+
+        def of_one(direction: dict[str, Array]) -> Array:
+            return jax.jvp(lambda part: sides(whole | part), (at,), (direction,))[1]
+
+        return jax.vmap(of_one, out_axes=1)(directions)
+
+    by_q = frame_derivatives(model, data)
+    sizes = {"qvel": model.nv, "act": model.na, "ctrl": model.nu}
+    whole = {name: getattr(start, name) for name in (*by_q, *sizes)}
+    columns = [derivatives(by_q)]
+    columns += [
+        derivatives({name: jnp.eye(size, dtype=a.dtype)}) for name, size in sizes.items() if size
+    ]
+    ends = [model.nv, model.nv + model.na]
+    left, rates, later = jnp.split(jnp.concatenate(columns, axis=1), ends)
+    bias_by_q, bias_by_v, more_by_q = inverse_derivatives(model, data, a, b - a)
+    left = left.at[:, : 2 * model.nv].add(jnp.concatenate([bias_by_q, bias_by_v], axis=1))
+    d = -solve(solution[1], left)
+    if not explicit:
+        later = later.at[:, : model.nv].add(more_by_q)
+        d = _solve_implicit(model, data, internal(data).M @ d - later)
+    value = jnp.concatenate([b, _activation_rates(model, data)])
+    return value, jnp.concatenate([d, rates])
+
+
+def _tendon_inertia_times(model: mjx.Model, data: mjx.Data, qacc: Array) -> Array:
+    """What armatures of tendons add to M qacc, (nv,)."""
+    if not model.ntendon:
+        return jnp.zeros_like(qacc)
+    arms = internal(data).ten_J
+    added = arms.T @ (model.tendon_armature[:, None] * arms)
+    return jnp.where(_in_inertia(model), added, 0.0) @ qacc
+
+
+def _tendon_bias(model: mjx.Model, data: mjx.Data, qacc: Array) -> Array:
+    """What armatures of tendons add to M qacc and bias forces, (nv,)."""
+    none = data.replace(qfrc_bias=jnp.zeros_like(qacc))
+    added: Array = mjx.tendon_bias(model, none).qfrc_bias
+    return added + _tendon_inertia_times(model, data, qacc)
+
+
+def _activation_rates(model: mjx.Model, data: mjx.Data) -> Array:
+    """Of Runge-Kutta rates (na,), else what the integrator adds in a timestep."""
+    if model.na == 0 or model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return data.act_dot
+    return mjx.euler(model, data).act - data.act
+
+
+def _explicit(model: mjx.Model) -> bool:
+    """Whether the integrator treats no damping implicitly."""
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    return bool(model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def _implicit(model: mjx.Model, data: mjx.Data) -> Array:
-    """The acceleration (nv,) of an integrator that treats damping implicitly."""
-    h = model.opt.timestep
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-            return data.qacc
-        by_velocity = -jnp.diag(model.dof_damping)
-    else:
-        by_velocity = _by_velocity(model, data)
-    factor = cholesky(symmetric(internal(data).M - h * by_velocity))
-    qacc = solve(factor, data.qfrc_smooth + data.qfrc_constraint)
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        return qacc
-    return _turning(model, data, factor, qacc)
+    """The acceleration b (nv,) of an integrator that treats damping implicitly.
+
+    W b = M a, with W = M - h D, and D (nv, nv) the derivative of forces by velocities. For free
+    bodies without other joints W = M - h D + h B, with the derivative B of their bias forces: the
+    C engine treats gyroscopic forces implicitly there, and nowhere else. B couples no two bodies.
+    """
+    if _explicit(model):
+        return data.qacc
+    return _solve_implicit(model, data, data.qfrc_smooth + data.qfrc_constraint)
+
+
+def _damping_times(model: mjx.Model, data: mjx.Data, qacc: Array) -> Array:
+    """(W - M) qacc, (nv,)."""
+    found = -_by_velocity(model, data) @ qacc
+    lone = _turning_implicitly(model)
+    if lone.size:
+        found = found.at[lone].add(_bias_rate(model, data, qacc)[lone])
+    return model.opt.timestep * found
+
+
+def _solve_implicit(model: mjx.Model, data: mjx.Data, forces: Array) -> Array:
+    """W^{-1} forces, for forces (nv,) or (nv, n)."""
+    h, lone = model.opt.timestep, _turning_implicitly(model)
+    inertia = symmetric(internal(data).M - h * _by_velocity(model, data))
+    if not lone.size:
+        return solve_positive(inertia, forces)
+    units = np.zeros((6, model.nv))
+    units[np.arange(6), lone] = 1.0  # of all bodies at once
+    rates = [_bias_rate(model, data, jnp.asarray(unit, forces.dtype)) for unit in units]
+    columns = forces.reshape(model.nv, -1)
+    found = solve_positive(inertia, jnp.concatenate([jnp.stack(rates, axis=1), columns], axis=1))
+    both = found[lone].at[:, :, :6].multiply(h).at[:, :, :6].add(jnp.eye(6))
+    for i in range(6):  # elimination; the matrix is close to 1, and needs no other pivots
+        row = both[:, i] / both[:, i, i, None]
+        both = (both - both[:, :, i, None] * row[:, None]).at[:, i].set(row)
+    return found[:, 6:].at[lone].set(both[:, :, 6:]).reshape(forces.shape)
+
+
+def _bias_rate(model: mjx.Model, data: mjx.Data, direction: Array) -> Array:
+    """The derivative of bias forces (nv,) by velocities, in a direction (nv,)."""
+
+    def bias(velocity: Array) -> Array:
+        return rne(model, com_vel(model, data.replace(qvel=velocity))).qfrc_bias
+
+    return jax.jvp(bias, (data.qvel,), (direction,))[1]
 
 
 def _by_velocity(model: mjx.Model, data: mjx.Data) -> Array:
     """The derivative of smooth forces by velocities (nv, nv) that the C engine takes.
 
-    It has none of actuators whose force is at an end of its range, no entries between two trees or
-    branches, as where a tendon couples them.
+    Euler's integrator takes that of joints' damping. The other one has none of actuators whose
+    force is at an end of its range, and no entries between two trees or branches, as where a tendon
+    couples them.
     """
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return -jnp.diag(model.dof_damping)
     off = int(model.opt.disableflags)
     found = jnp.zeros((model.nv, model.nv), data.qvel.dtype)
     if model.nu and not off & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
@@ -210,33 +395,14 @@ def _by_velocity(model: mjx.Model, data: mjx.Data) -> Array:
     return jnp.where(_in_line(model), found, 0.0)
 
 
-def _turning(model: mjx.Model, data: mjx.Data, factor: Array, qacc: Array) -> Array:
-    """`qacc` (nv,), that of free bodies without other joints changed as by implicit bias forces.
-
-    The C engine treats the gyroscopic forces of these implicitly, and those of all other bodies
-    not: (S + h B) a = S qacc, with the matrix S that has this factor, and the derivative B of bias
-    forces by velocities. It couples no two bodies.
-    """
+def _turning_implicitly(model: mjx.Model) -> np.ndarray:
+    """Degrees of freedom of each free body without other joints, (bodies, 6); none for Euler."""
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        return np.zeros((0, 6), int)
     starts = np.flatnonzero(np.diff(model.dof_treeid, prepend=-1))
     ends = np.append(starts[1:], model.nv)
     free = np.isin(starts, model.jnt_dofadr[model.jnt_type == FREE]) & (ends - starts == 6)
-    entries = starts[free][:, None] + np.arange(6)  # (free bodies, 6)
-    if not entries.size:
-        return qacc
-
-    def bias(velocity: Array) -> Array:
-        return rne(model, com_vel(model, data.replace(qvel=velocity))).qfrc_bias
-
-    units = np.zeros((6, model.nv))
-    units[np.arange(6), entries] = 1.0  # of all bodies at once
-    rates = [jax.jvp(bias, (data.qvel,), (jnp.asarray(e, qacc.dtype),))[1] for e in units]
-    change = model.opt.timestep * jnp.stack([solve(factor, rate) for rate in rates], axis=1)
-    wanted = jnp.eye(6) + change[entries]  # (free bodies, 6, 6)
-    both = jnp.concatenate([wanted, qacc[entries][..., None]], axis=2)
-    for i in range(6):  # elimination; the matrix is close to 1, and needs no other pivots
-        row = both[:, i] / both[:, i, i, None]
-        both = (both - both[:, :, i, None] * row[:, None]).at[:, i].set(row)
-    return qacc.at[entries].set(both[:, :, 6])
+    return starts[free][:, None] + np.arange(6)
 
 
 def _in_line(model: mjx.Model) -> np.ndarray:
@@ -282,8 +448,8 @@ def _runge_kutta(model: mjx.Model, joints: Joints, x: Array, u: Array) -> Array:
 
     def stage(carry: tuple[Array, Array], entry: Array) -> tuple[tuple[Array, Array], None]:
         rate, total = carry
-        data = forward(model, joints.integrate(x, h * entry[0] * rate), u)
-        rate = jnp.concatenate([data.qvel, data.qacc, data.act_dot])
+        x_at = joints.integrate(x, h * entry[0] * rate)
+        rate = jnp.concatenate([x_at[model.nq : model.nq + model.nv], _rates(model, x_at, u)])
         return (rate, total + entry[1] * rate), None
 
     zero = jnp.zeros(2 * model.nv + model.na, x.dtype)

@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -115,6 +116,49 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     )
 
 
+def frame_derivatives(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
+    """Derivatives of what `kinematics` finds by each degree of freedom, (nv, ...), by name.
+
+    A degree of freedom moves all frames that it carries as one rigid body, by its motion `cdof`.
+    """
+    sums, bodies, joints = _Sums.of(model), np.arange(model.nbody), Joints.of(model)
+    moves = sums.moves > 0
+    turning, moving = data.cdof[:, None, :3], data.cdof[:, None, 3:]
+    about = data.subtree_com[model.body_rootid]
+
+    def turned(carried: np.ndarray, vectors: Array) -> Array:
+        """Of vectors (n, 3), of which each is carried or not, (nv, n)."""
+        return jnp.where(carried[:, :, None], jnp.cross(turning, vectors), 0.0)
+
+    def of_points(carried: np.ndarray, body: np.ndarray, points: Array) -> Array:
+        return turned(carried, points - about[body]) + jnp.where(carried[:, :, None], moving, 0.0)
+
+    def of_axes(carried: np.ndarray, axes: Array) -> Array:
+        return jnp.stack([turned(carried, axes[:, :, k]) for k in range(3)], axis=-1)
+
+    ends = np.append(np.asarray(model.jnt_dofadr)[1:], model.nv) - 1
+    before, on = sums.before[ends].T > 0, np.asarray(model.jnt_bodyid)
+    fixed = np.asarray(model.jnt_type)[:, None] == FREE
+    spin = 0.5 * jnp.pad(turning, ((0, 0), (0, 0), (1, 0)))
+    still = jnp.zeros(model.nv, data.qpos.dtype)
+    found = {
+        "qpos": jax.jacfwd(lambda dq: joints.integrate(data.qpos, dq))(still).T,
+        "xanchor": of_points(before, on, data.xanchor),
+        "xaxis": jnp.where(fixed, 0.0, turned(before, data.xaxis)),
+        "xquat": multiply(jnp.where(moves.T[:, :, None], spin, 0.0), data.xquat),
+    }
+    for name, body in (
+        ("x", bodies),
+        ("xi", bodies),
+        ("geom_x", model.geom_bodyid),
+        ("site_x", model.site_bodyid),
+    ):
+        carried = moves[np.asarray(body)].T
+        found[f"{name}pos"] = of_points(carried, body, getattr(data, f"{name}pos"))
+        found[f"{name}mat"] = of_axes(carried, getattr(data, f"{name}mat"))
+    return found
+
+
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.com_pos`: `data` with centres of mass, inertias and motions about them.
 
@@ -178,6 +222,67 @@ def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     momentum = _inertia_times(inertia, data.cvel)
     force = _inertia_times(inertia, acceleration) + _crossed_force(data.cvel, momentum)
     return data.replace(qfrc_bias=jnp.sum(data.cdof * _summed(moves.T, force), axis=1))
+
+
+def inverse_derivatives(
+    model: mjx.Model, data: mjx.Data, qacc: Array, more: Array
+) -> tuple[Array, Array, Array]:
+    """Derivatives (nv, nv) of the forces tau = M a + bias of an acceleration a = `qacc` (nv,).
+
+    By positions, by velocities, and that of M w by positions, with w = `more` (nv,); armatures and
+    tendons are left out. In closed form (Singh, Russell and Wensing 2022): a degree of freedom j
+    turns all that it moves about its axis s_j. With the velocity v and the acceleration a of the
+    frame before it, where the world's a is -g,
+
+        s_j' = v x s_j      s_j'' = a x s_j + v x s_j'      s_j* = (velocity behind j) x s_j
+        d tau_i / d q_j = s_i . (B_i s_j' + I_i s_j'')        j moves s_i, or is of the same joint
+        d tau_i / d q_j = s_i . (B_j s_j' + I_j s_j'' + s_j x f_j)                    i moves s_j
+        d tau_i / d v_j = s_i . (B s_j + I (s_j' + s_j*))                  B, I of i or j as above
+
+    B_i, I_i and f_i are sums over all bodies that i moves: of the inertias I, of the matrices that
+    take m to v x (I m) - I (v x m) + m x (I v), and of the forces I a + v x (I v).
+    """
+    sums, S, inertia, velocity = _Sums.of(model), data.cdof, internal(data).cinert, data.cvel
+    moves, before, momentum = sums.moves, sums.before, _inertia_times(inertia, velocity)
+    above = before + moves[np.asarray(model.dof_bodyid)] * (1 - before) * (1 - before.T)
+
+    def slope(unit: Array) -> Array:
+        """B m of each body for one m (6,)."""
+        m = jnp.broadcast_to(unit, velocity.shape)
+        own = _crossed_force(velocity, _inertia_times(inertia, m)) + _crossed_force(m, momentum)
+        return own - _inertia_times(inertia, _crossed(velocity, m))
+
+    slopes = jnp.concatenate([slope(unit) for unit in jnp.eye(6, dtype=S.dtype)], axis=1)
+    below = _summed(moves.T, jnp.concatenate([inertia, slopes], axis=1))
+    inertias, slopes = below[:, :10], below[:, 10:].reshape(-1, 6, 6)  # B_j: columns come first
+    moved, swept = _inertia_times(inertias, S), jnp.sum(slopes * S[:, None], axis=2)
+
+    def derivative(first: Array, second: Array, force: Array) -> Array:
+        """s_i . (B s_j' + I s_j'') for such columns (nv, 6), and forces of bodies (nbody, 6)."""
+        own = jnp.sum(slopes * first[:, :, None], axis=1) + _inertia_times(inertias, second)
+        own = own + _crossed_force(S, _summed(moves.T, force))
+        by_above = jnp.sum(swept[:, None] * first + moved[:, None] * second, axis=2)
+        by_below = jnp.sum(S[:, None] * own, axis=2)
+        return jnp.where(above > 0, by_above, 0.0) + jnp.where(before.T > 0, by_below, 0.0)
+
+    rate, speed = data.cdof_dot, data.qvel[:, None]
+    world = jnp.zeros(6, S.dtype)
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        world = world.at[3:].set(-model.opt.gravity)
+    motion = S * qacc[:, None] + rate * speed
+    force = _inertia_times(inertia, world + _summed(moves, motion))
+    force = force + _crossed_force(velocity, momentum)
+    second = _crossed(world + _summed(before, motion), S)
+    second = second + _crossed(_summed(before, S * speed), rate)
+    behind = _crossed(_summed(above, S * speed), S)
+    push, none = S * more[:, None], jnp.zeros_like(S)
+    return (
+        derivative(rate, second, force),
+        derivative(S, rate + behind, jnp.zeros_like(force)),
+        derivative(
+            none, _crossed(_summed(before, push), S), _inertia_times(inertia, _summed(moves, push))
+        ),
+    )
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.kernels.recursion import affine_recursion
 from mjx_drax.method.bounds import Sides
 from mjx_drax.method.gauss_newton import slack_step, stage_steps, start_of, with_constraints
 from mjx_drax.method.langevin import State
@@ -73,6 +74,12 @@ LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 
 HALF, SHORT = 0.5, 0.25
 """Where curvature is learned: steps up to HALF keep the damping, steps up to SHORT raise it."""
+
+IDLE = 0.1
+"""The barrier falls where the model promises less than this share of what its weight costs."""
+
+INSIDE = 0.99
+"""Share of the way to their bounds that controls may be moved to bend a step."""
 
 TRIES = 3
 """Factorizations in one iteration: without learned curvature, then with more damping each time."""
@@ -304,7 +311,7 @@ def _moved(
     assert v is not None  # for the type checker
     assert derivatives is not None
     ends = slacks_of(problem, knots)
-    rho = _barrier(problem, knots, v, now.barrier, residual, polish, scales)
+    rho = _barrier(problem, knots, v, now, residual, polish, scales)
 
     central = _central(problem, knots, rho)
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
@@ -340,7 +347,9 @@ def _moved(
     of_cost, of_defects = _promised(model, d, left, eta)
     promised = of_cost - rho * _logs(ends, moves, reach), of_defects
     rows = Multipliers(scales.x, Stagewise(*row_scales(derivatives, scales, model.trajectory)))
-    alpha, X, parts = _line_search(problem, model, d, reach, eta, rho, promised, rows, now.funnel)
+    alpha, X, parts = _line_search(
+        problem, model, d, gains, reach, eta, rho, promised, rows, now.funnel
+    )
     found = ok & (alpha > 0.0)
     alpha = jnp.where(found, alpha, 0.0)
     X = jax.tree.map(lambda a, b: jnp.where(found, a, b), X, knots)
@@ -384,7 +393,7 @@ def _barrier(
     problem: Problem,
     knots: Trajectory,
     v: Sides,
-    rho: Array,
+    now: Progress,
     residual: Residual,
     polish: Polish,
     scales: Scales,
@@ -392,18 +401,20 @@ def _barrier(
     """rho, lower where the barrier's problem is nearly solved; at most two steps down.
 
     It is if slopes, defects and gaps are below ten times rho, as costs; or if the residual's other
-    parts are small, and below what the bounds' part is at this rho.
+    parts are small, and below what the bounds' part is at this rho; or if the last model promised
+    to gain far less than the barrier costs.
     """
     gaps = jax.tree.leaves(products(problem, knots, v))
     count = jnp.maximum(sum((jnp.sum(p > 0.0) for p in gaps), start=jnp.zeros((), int)), 1)
     floor = 0.1 * polish.tolerance * scales.cost / count
-    others = residual.others
+    others, rho = residual.others, now.barrier
     for _ in range(2):
         off = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in gaps]
         centred = jnp.max(jnp.stack(off)) < 10.0 * rho
         small = (others < NEAR) & (others < count * rho / scales.cost)
         lower = jnp.minimum(0.2 * rho, scales.terms * (rho / scales.terms) ** 1.5)
-        falls = centred & ((residual.error < 10.0 * rho) | small)
+        idle = now.promise < IDLE * count * rho / scales.cost
+        falls = centred & ((residual.error < 10.0 * rho) | small | idle)
         rho = jnp.where(falls, jnp.maximum(lower, floor), rho)
     return jnp.maximum(rho, floor)
 
@@ -575,6 +586,7 @@ def _line_search(
     problem: Problem,
     model: Model,
     d: Trajectory,
+    gains: Array,
     reach: Array,
     eta: Multipliers,
     rho: Array,
@@ -587,20 +599,30 @@ def _line_search(
     h, relative to `rows`, may not more than double where it is above 1: a cost without a lower
     bound would lead away from the constraints for ever. A step that lowers the cost as promised
     may let h grow up to the `funnel`, which then narrows: the merit function alone allows but
-    short steps along curved constraints (Maratos 1978; a funnel: Gould and Toint 2010).
+    short steps along curved constraints (Maratos 1978; a funnel: Gould and Toint 2010). So every
+    step is tried `_bent` along the dynamics too; of two of one size that of lower merit is taken.
 
     Returns:
         the size, the new knots, and whether the funnel was used.
     """
     knots = model.trajectory
 
-    def candidate(alpha: Array) -> tuple[Array, Array, Array, Trajectory]:
-        new = problem.displaced(knots, jax.tree.map(lambda d: alpha * d, d))
-        costs, penalties, h = _merit(problem, new, eta, rho)
-        return costs, penalties, _worst(h, rows), new
-
     sizes = jnp.append(jnp.asarray(LADDER, d.u.dtype) * reach, 0.0)
-    costs, penalties, apart, candidates = jax.vmap(candidate)(sizes)
+    straight = jax.vmap(
+        lambda alpha: problem.displaced(knots, jax.tree.map(lambda d: alpha * d, d))
+    )(sizes)
+
+    def tried(new: Trajectory, _: None) -> tuple[Trajectory, Any]:
+        merits = jax.vmap(lambda new: _merit(problem, new, eta, rho))(new)
+        return _bent(problem, model, gains, new, merits[2].dynamics), (new, merits)
+
+    # in a loop, so that f compiles once
+    both = jax.lax.scan(tried, straight, None, 2)[1]
+    candidates, (costs, penalties, h) = jax.tree.map(
+        lambda a: jnp.concatenate([a[1, :-1], a[0]]), both
+    )
+    ladder, sizes = sizes[:-1], jnp.append(sizes[:-1], sizes)
+    apart = jax.vmap(lambda h: _worst(h, rows))(h)
     cheaper = jnp.sum(costs - costs[-1], axis=1)
     change = cheaper + jnp.sum(penalties - penalties[-1], axis=1)
     rounding = 10.0 * jnp.finfo(costs.dtype).eps * jnp.sum(jnp.abs(costs[-1]) + penalties[-1])
@@ -608,9 +630,33 @@ def _line_search(
     lowers &= jnp.isfinite(change) & (apart <= jnp.maximum(2.0 * apart[-1], 1.0))
     falls = (promised[0] < 0.0) & (cheaper <= ARMIJO * sizes * promised[0]) & (apart <= funnel)
     allowed = (lowers | falls).at[-1].set(True)
-    best = jnp.argmax(allowed)
+    largest = jnp.max(jnp.where(allowed, sizes, 0.0))
+    change = change.at[: len(ladder)].add(rounding)  # to bend by rounding errors is no gain
+    best = jnp.argmin(jnp.where(allowed & (sizes == largest), change, jnp.inf))
     chosen: Trajectory = jax.tree.map(lambda z: z[best], candidates)
     return sizes[best], chosen, ~lowers[best] & (sizes[best] > 0.0)
+
+
+def _bent(
+    problem: Problem, model: Model, gains: Array, straight: Trajectory, defects: Array
+) -> Trajectory:
+    """Knots (n, K, ...) without most of their defects (n, K, ndx), states and controls changed.
+
+    One Newton step from the knots to the rollout of their controls with feedback K:
+
+        dx_{k+1} = (A_k + B_k K_k) dx_k + h_k,    du_k = K_k dx_k,    dx_0 = 0
+
+    A second-order correction, as Maratos' effect asks for, that costs no factorization.
+    """
+    assert model.derivatives is not None
+    A, B = model.derivatives.dynamics.A, model.derivatives.dynamics.B
+    dx = jnp.moveaxis(affine_recursion(A + B @ gains, jnp.moveaxis(defects, 0, -1)), -1, 0)
+    before = jnp.concatenate([jnp.zeros_like(dx[:, :1]), dx[:, :-1]], axis=1)
+    du = (gains @ before[..., None])[..., 0]
+    here, (lower, upper) = model.trajectory.u, slacks_of(problem, model.trajectory)
+    u = jnp.clip(straight.u + du, here - INSIDE * lower.u, here + INSIDE * upper.u)
+    x = jax.vmap(jax.vmap(problem.dynamics.integrate))(straight.x, dx)
+    return replace(straight, x=x, u=u)
 
 
 def _worst(h: Multipliers, rows: Multipliers) -> Array:

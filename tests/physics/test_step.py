@@ -199,11 +199,21 @@ IMPLICIT = """
 
 
 @pytest.mark.parametrize(
-    "derivatives", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["step", "derivatives"]
+    ("friction", "derivatives"),
+    [
+        (0.0, False),
+        pytest.param(0.0, True, marks=pytest.mark.slow),
+        pytest.param(0.05, True, marks=pytest.mark.slow),
+    ],
 )
-def test_implicitfast_is_the_c_engines(derivatives):
-    """Forces at their ends and within, tendons between trees, and a free body that turns."""
-    model = mujoco.MjModel.from_xml_string(IMPLICIT)
+def test_implicitfast_is_the_c_engines(friction, derivatives):
+    """Forces at their ends and within, tendons between trees, and a free body that turns.
+
+    With friction there are constraints, and derivatives of a step have a rule of their own.
+    """
+    model = mujoco.MjModel.from_xml_string(
+        IMPLICIT.replace('damping="0.1"', f'damping="0.1" frictionloss="{friction}"')
+    )
     qpos = moved(model, model.qpos0, np.linspace(0.1, 0.6, model.nv))
     x = np.concatenate([qpos, np.linspace(-1.0, 2.0, model.nv)])
     controls = np.array([3.0, 0.1])[:, None] * np.ones(model.nu)

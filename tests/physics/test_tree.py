@@ -8,7 +8,16 @@ import pytest
 from mjx_drax.models import path
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.tree import com_pos, com_vel, kinematics, mass_matrix, rne
+from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.tree import (
+    com_pos,
+    com_vel,
+    frame_derivatives,
+    inverse_derivatives,
+    kinematics,
+    mass_matrix,
+    rne,
+)
 
 EVERY_JOINT = """<mujoco><worldbody>
 <body name="moved" mocap="true" pos="1 0 0" quat="0.6 0.8 0 0"><geom size="0.1"/></body>
@@ -70,3 +79,38 @@ def test_inertias_velocities_and_bias_forces_are_those_of_the_c_engine(model, gr
             np.testing.assert_allclose(
                 getattr(found, name), getattr(c_data, name), atol=1e-9, err_msg=name
             )
+
+
+@pytest.mark.slow
+def test_closed_derivatives_are_those_of_differences():
+    """Of frames by positions, and of M a + bias by positions and velocities, in one direction."""
+    with jax.enable_x64(True):
+        _, device, start = drawn(EVERY_JOINT)
+        start = kinematics(device, start)
+        a, w, way = np.random.default_rng(1).normal(size=(3, device.nv))
+
+        @jax.jit
+        def everything(dq, dv):
+            qpos = Joints.of(device).integrate(start.qpos, dq)
+            data = kinematics(device, start.replace(qpos=qpos, qvel=start.qvel + dv))
+            data = rne(device, com_vel(device, mass_matrix(device, com_pos(device, data))))
+            M = data._impl.M - jnp.diag(device.dof_armature)
+            return data, M @ a + data.qfrc_bias, M @ w
+
+        def slopes(dq, dv):
+            return jax.tree.map(
+                lambda x, y: (np.asarray(x, float) - np.asarray(y, float)) / 2e-6,
+                everything(1e-6 * dq, 1e-6 * dv),
+                everything(-1e-6 * dq, -1e-6 * dv),
+            )
+
+        still = np.zeros(device.nv)
+        data = everything(still, still)[0]
+        frames, by_q, more_by_q = slopes(way, still)
+        _, by_v, _ = slopes(still, way)
+        for name, found in jax.jit(frame_derivatives)(device, data).items():
+            along = np.tensordot(way, found, 1)
+            np.testing.assert_allclose(along, getattr(frames, name), atol=1e-7, err_msg=name)
+        found = jax.jit(inverse_derivatives)(device, data, a, w)
+        for mine, wanted in zip(found, (by_q, by_v, more_by_q), strict=True):
+            np.testing.assert_allclose(mine @ way, wanted, atol=1e-6)

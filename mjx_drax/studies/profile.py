@@ -1,0 +1,106 @@
+"""Which GPU kernels an iteration runs, and how long the GPU waits between them.
+
+    python -m mjx_drax.studies.profile TASK[:CHAINS] ... [--iterations N] [--rows N]
+
+For the flow and for the polish of each task: the time of an iteration, how many kernels it starts,
+the share of the time in which one of them runs, and the kernels that take longest. Taken from
+JAX's profiler, in the second of two solves of N iterations each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import json
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from mjx_drax import tasks
+from mjx_drax.polish.interior_point import Polish
+from mjx_drax.problem.problem import Problem
+from mjx_drax.search.restarts import Restarts, Rollouts
+from mjx_drax.solution.solve import solve
+
+
+def kernels(folder: Path) -> list[dict[str, Any]]:
+    """The events of GPU streams in a trace, with name, ts and dur in microseconds."""
+    (trace,) = folder.rglob("perfetto_trace.json.gz")
+    events = json.loads(gzip.decompress(trace.read_bytes()))["traceEvents"]
+    devices = {
+        e["pid"]
+        for e in events
+        if e.get("name") == "process_name" and "GPU" in e["args"].get("name", "")
+    }
+    streams = {
+        (e["pid"], e["tid"])
+        for e in events
+        if e.get("name") == "thread_name"
+        and e["pid"] in devices
+        and e["args"].get("name", "").startswith("Stream")
+    }
+    return [e for e in events if e.get("ph") == "X" and (e["pid"], e["tid"]) in streams]
+
+
+def busy(events: list[dict[str, Any]]) -> float:
+    """Time [us] in which at least one event runs."""
+    end, total = 0.0, 0.0
+    for start, stop in sorted((e["ts"], e["ts"] + e["dur"]) for e in events):
+        total += max(stop - max(start, end), 0.0)
+        end = max(end, stop)
+    return total
+
+
+def measured(problem: Problem, chains: int, solver: Restarts, iterations: int, rows: int) -> None:
+    """Solve twice, and print the table of the second solve."""
+    solve(problem, chains=chains, solver=solver, progress=False)
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder, create_perfetto_trace=True):
+            solution = solve(problem, chains=chains, solver=solver, seed=1, progress=False)
+        events = kernels(Path(folder))
+    solve_time = solve(problem, chains=chains, solver=solver, seed=1, progress=False).solve_time
+    count = max(solution.iterations, 1)
+    milliseconds = 1e3 * solve_time / count
+    print(
+        f"{count} iterations of {milliseconds:.3f} ms: {len(events) / count:.0f} kernels, "
+        f"busy for {busy(events) / count / 1e3:.3f} ms\n\n| kernel | times | ms |\n|---|---|---|"
+    )
+    sums: dict[str, list[float]] = defaultdict(list)
+    for event in events:
+        sums[event["name"]].append(event["dur"])
+    for name, times in sorted(sums.items(), key=lambda item: -sum(item[1]))[:rows]:
+        print(f"| {name[:60]} | {len(times) / count:.1f} | {sum(times) / count / 1e3:.4f} |")
+    print(flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Profile and print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("tasks", nargs="+", metavar="TASK[:CHAINS]")
+    parser.add_argument("--iterations", type=int, default=100)
+    parser.add_argument("--rows", type=int, default=20)
+    options = parser.parse_args(arguments)
+    n, rows = options.iterations, options.rows
+    usual = Restarts(attempts=1, rollouts=Rollouts(first=0, rounds=0))
+    flow = replace(usual, descent=n, flow=replace(usual.flow, tail=0), polish=Polish(iterations=0))
+    polish = replace(usual, descent=10, polish=Polish(1e-30, n))
+    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}")
+    for word in options.tasks:
+        name, _, chains = word.partition(":")
+        problem = tasks.load(name).make()
+        for what, solver in (("flow", flow), ("polish", polish)):
+            if what == "polish" and problem.dynamics.kinked:
+                continue
+            print(f"\n## {name}, {chains or 64} chains, {what}\n")
+            measured(problem, int(chains or 64), solver, n, rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

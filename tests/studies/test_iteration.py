@@ -1,0 +1,14 @@
+"""The study of the parts of an iteration."""
+
+import pytest
+
+from mjx_drax.studies import iteration
+
+
+@pytest.mark.slow
+def test_a_row_has_a_positive_time_for_every_part(capsys):
+    assert iteration.main(["cartpole_swingup:2", "--repeats", "1"]) == 0
+    row = capsys.readouterr().out.splitlines()[-1].strip("|").split("|")
+    assert row[0].strip() == "cartpole_swingup"
+    assert len(row) == 8
+    assert all(float(entry) > 0 for entry in row[2:7])
