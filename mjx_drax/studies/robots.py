@@ -40,8 +40,8 @@ def double_cart_pole(path: Path) -> Problem:
     upright = {"slider": 0.0, "hinge_1": math.pi, "hinge_2": 0.0}
     return from_mjcf(
         on.model,
-        horizon=2.0,
-        dt=0.02,
+        horizon=3.0,
+        dt=0.03,
         running_residual=on.control(weight=1e-2),
         terminal_residual=on.posture(upright, weight=100.0) + on.velocity(weight=10.0),
         goal=lambda data: data.site("tip").xpos[2] > 3.95 and np.abs(data.qvel).max() < 0.5,
@@ -117,7 +117,7 @@ def arm(start: Sequence[float], path: Path) -> Problem:
     )
 
 
-def _too_near(links: tuple[int, ...], ball: np.ndarray, data: Any) -> Array:
+def _too_near(links: tuple[int, ...], ball: np.ndarray, data: Any, u: Array) -> Array:
     """How much nearer than 0.15 m to a ball the frames of links are [m], about."""
     squared = jnp.sum((data.xpos[jnp.array(links)] - ball) ** 2, axis=1)
     return (0.15**2 - squared) / 0.3
