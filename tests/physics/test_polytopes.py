@@ -9,6 +9,8 @@ from scipy.spatial import ConvexHull
 from mjx_drax.physics import polytopes
 from mjx_drax.physics.collision import polytope
 
+pytestmark = pytest.mark.slow
+
 
 def hull(count, seed):
     """A polytope of corners on an ellipsoid, 0.1 to 0.2 m large, about 0."""
@@ -44,7 +46,6 @@ def test_contacts_of_hulls_are_as_deep_as_the_hulls_overlap():
     assert np.median(-dist.min(axis=1) - depths) < 1e-9
 
 
-@pytest.mark.slow
 def test_derivatives_of_contacts_take_little_memory():
     one, other = hull(300, 1), hull(300, 2)
 
