@@ -5,7 +5,6 @@ It may be heavier than the model says, be pushed, shaken, and measured with nois
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +16,7 @@ from mjx_drax.base.numbers import numbers
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import index
-from mjx_drax.physics.states import Floats, integrate, set_state
+from mjx_drax.physics.states import Floats, converged, integrate, set_state
 from mjx_drax.problem.problem import Problem
 
 LASTS = 0.1
@@ -43,6 +42,8 @@ class Push:
 
 class Plant:
     """MuJoCo's C engine from a problem's x_init, one physics step at a time.
+
+    As in the certificate its contact solver converges, whatever options the model's file has.
 
     >>> plant = mjx_drax.Plant(problem, mass=1.1, pushes=[mjx_drax.Push(2.0, "pole", (5, 0, 0))])
     >>> while plant.time < 5.0:
@@ -80,7 +81,7 @@ class Plant:
         require_positive("mass", mass, "a positive factor, 1 for no error")
         for push in pushes:
             _require_push(push)
-        self.model: mujoco.MjModel = copy.copy(model)
+        self.model: mujoco.MjModel = converged(model)
         self.model.body_mass[:] *= mass
         self.model.body_inertia[:] *= mass
         self.data = mujoco.MjData(self.model)

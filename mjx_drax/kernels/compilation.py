@@ -37,7 +37,7 @@ def run_once(function: Callable[..., Any], *arguments: Any) -> Any:
             )
         except jax.errors.JaxRuntimeError:  # jaxlib 0.11 does not know this option
             program = lowered.compile(compiler_options=QUICKLY)
-        return program(*jax.device_put(arguments, device))
+        return jax.block_until_ready(program(*jax.device_put(arguments, device)))
 
 
 @lru_cache
@@ -81,8 +81,12 @@ def keep_none() -> None:
 
 
 @contextmanager
-def said_plainly(name: str) -> Iterator[None]:
+def said_plainly(what: str, hint: str = "with fewer chains") -> Iterator[None]:
     """What JAX and its compiler raise, as a sentence.
+
+    Args:
+        what: is compiled and run.
+        hint: what to try where memory is short.
 
     Raises:
         DraxError: with the first line of what they said, and what to try.
@@ -90,17 +94,16 @@ def said_plainly(name: str) -> Iterator[None]:
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
-        hint = "with fewer chains"
         if "RESOURCE_EXHAUSTED" not in str(error):
             hint += ", on a CPU (JAX_PLATFORMS=cpu), or with another version of jax"
         raise DraxError(
-            f"JAX failed to compile or run the solve of {name} ({reason(error)}): try {hint}."
+            f"JAX failed to compile or run {what} ({reason(error)}): try {hint}."
         ) from error
     except ValueError as error:
         if isinstance(error, DraxError) or "Cannot lower jaxpr" not in str(error):
             raise
         raise DraxError(
-            f"JAX failed to compile the solve of {name} ({reason(error)}): give numbers to jax as "
+            f"JAX failed to compile {what} ({reason(error)}): give numbers to jax as "
             "jnp.asarray(array) inside of functions, or try another version of jax."
         ) from error
 

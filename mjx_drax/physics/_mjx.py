@@ -16,6 +16,9 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
 
     # Not public: what MJX can collide, and how; frames of contacts; the law of constraint forces
     from mujoco.mjx._src import collision_driver as collision_driver
+    from mujoco.mjx._src.collision_convex import (
+        _create_contact_manifold as contact_manifold,  # noqa: F401
+    )
     from mujoco.mjx._src.collision_convex import _manifold_points as four_of  # noqa: F401
     from mujoco.mjx._src.collision_driver import (
         _COLLISION_FUNC as COLLISIONS,  # noqa: F401
@@ -25,6 +28,9 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     )
     from mujoco.mjx._src.collision_driver import (
         has_collision_fn as has_collision_fn,
+    )
+    from mujoco.mjx._src.math import (
+        closest_segment_to_segment_points as closest_segment_to_segment_points,
     )
     from mujoco.mjx._src.math import make_frame as make_frame
     from mujoco.mjx._src.solver import Context as ConstraintForces  # noqa: F401

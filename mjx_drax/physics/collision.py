@@ -7,7 +7,8 @@
   has others where a capsule is steeper than 60 degrees.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
   points on them.
-- Two polytopes touch at every point once, where MJX repeats some.
+- Two polytopes touch at every point once, where MJX repeats some, and hulls of meshes take less
+  memory (`polytopes`).
 - Hulls of meshes have the normals of their faces; see `polytope`.
 - Pairs of geoms can be left out, by `exclude_signature` of the MJX model.
 """
@@ -27,7 +28,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial import ConvexHull, QhullError
 
-from mjx_drax.physics import curved
+from mjx_drax.physics import curved, polytopes
 from mjx_drax.physics._mjx import (
     COLLISIONS,
     ConvexMesh,
@@ -329,6 +330,28 @@ def with_corners(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Con
     return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
 
+def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
+    """The same of boxes with meshes, and of two meshes."""
+
+    def hull(place: int, g: Array) -> ConvexMesh:
+        if int(key.types[place]) == BOX:
+            return _hull(BOX, model.geom_size[g])
+        mesh: ConvexMesh = model._impl.mesh_convex[key.data_ids[place]]
+        return mesh
+
+    def of_pair(pair: Array) -> Contacts:
+        one, other = pair
+        turn, origin = data.geom_xmat[other], data.geom_xpos[other]
+        centre, axes = turn.T @ (data.geom_xpos[one] - origin), turn.T @ data.geom_xmat[one]
+        placed = polytopes.moved(hull(0, one), centre, axes)
+        dist, pos, normal = polytopes.contacts(placed, hull(1, other))
+        frame = jnp.repeat(make_frame(turn @ normal)[None], len(dist), axis=0)
+        return dist, pos @ turn.T + origin, frame
+
+    dist, pos, frame = jax.vmap(of_pair)(geom)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
+
+
 def _distinct(collide: Any) -> Any:
     """MJX's function of two polytopes, with no contact twice.
 
@@ -368,6 +391,8 @@ _OWN = {
     (ELLIPSOID, MESH): _ELLIPSOIDS,
     (CYLINDER, BOX): _CYLINDERS,
     (CYLINDER, MESH): _CYLINDERS,
-    **{pair: _distinct(COLLISIONS[pair]) for pair in ((BOX, BOX), (BOX, MESH), (MESH, MESH))},
+    (BOX, BOX): _distinct(COLLISIONS[BOX, BOX]),
+    (BOX, MESH): _distinct(between_hulls),
+    (MESH, MESH): _distinct(between_hulls),
 }
 """Kinds of geoms, the lower one first, and what collides them in place of MJX."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Collection, Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -143,12 +144,23 @@ class Engine:
 
     def active_contacts(self, x: Floats) -> int:
         """Contacts that act at x (nx,), of the friction dimension that has the most."""
+        contact = self._contacts(x)
+        return int(np.bincount(contact.dim[contact.efc_address >= 0], minlength=1).max())
+
+    def hulls_touch(self, x: Floats) -> bool:
+        """Whether at x (nx,) a contact of a mesh with a box or a mesh acts."""
+        contact = self._contacts(x)
+        kinds = self.model.geom_type[contact.geom[contact.efc_address >= 0]]
+        mesh, box = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_BOX
+        return bool(((kinds == mesh).any(axis=1) & np.isin(kinds, (mesh, box)).all(axis=1)).any())
+
+    def _contacts(self, x: Floats) -> Any:
+        """All contacts at x (nx,), whether they act or not."""
         data = mujoco.MjData(self.model)
         set_state(self.model, data, x)
-        with quiet():
+        with quiet(), without(self._without):
             mujoco.mj_forward(self.model, data)
-        acting = data.contact.dim[data.contact.efc_address >= 0]
-        return int(np.bincount(acting, minlength=1).max())
+        return data.contact
 
     def jacobian(self, x: Floats, u: Floats, eps: float = 1e-6) -> Floats:
         """[df/dx df/du] (ndx, ndx + nu) by central differences in tangent space."""

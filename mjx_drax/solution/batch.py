@@ -249,7 +249,7 @@ def solve_batch(
             mesh=mesh_for(size, devices),
             checkpoint=file,
         )
-        with report as search.chunk_done, said_plainly("problems"):
+        with report as search.chunk_done, said_plainly("the solve of problems"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         return _certified(family, settings, chains, found, interrupted, tolerances)

@@ -235,7 +235,7 @@ def minimize(
             mesh=mesh,
             guess=knots,
         )
-        with report as search.progress, said_plainly(program.name):
+        with report as search.progress, said_plainly(f"the solve of {program.name}"):
             found = search.run()
         state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
         multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])

@@ -109,7 +109,7 @@ def solve(
             checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
             recorder=recorder,
         )
-        with report as search.progress, said_plainly(problem.name):
+        with report as search.progress, said_plainly(f"the solve of {problem.name}"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         solution = _certified(problem, settings, seed, found, interrupted, tolerances)

@@ -24,6 +24,7 @@ from typing import Any
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import write_json
+from mjx_drax.problem.problem import Problem
 
 Row = dict[str, Any]
 
@@ -95,10 +96,7 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
     """
     from mjx_drax.kernels.compilation import keep_none
     from mjx_drax.modelling.postures import reach
-    from mjx_drax.physics.dynamics import MjxDynamics
-    from mjx_drax.physics.mjx_model import constraint_rows
     from mjx_drax.physics.source import load
-    from mjx_drax.solution.solve import solve
 
     keep_none()
     row: Row = {"model": name}
@@ -107,14 +105,31 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
         if host.nv and not host.nu:
             host = load(path, "torque")
         row |= {"nq": host.nq, "nv": host.nv, "nu": host.nu}
-        problem = reach(host, seed, name=name)
-        assert isinstance(problem.dynamics, MjxDynamics)
-        row |= {"rows": constraint_rows(problem.dynamics.model), "knots": problem.horizon}
-        solution = solve(problem, chains, seed, progress=False)
+        return row | solved(reach(host, seed, name=name), chains, seed)
     except DraxError as error:
         return row | {"refused": str(error)}
+
+
+def solved(problem: Problem, chains: int, seed: int) -> Row:
+    """Solve the problem of a model with default settings: what the columns of the table show.
+
+    Raises:
+        DraxError: it cannot be solved.
+    """
+    from mjx_drax.physics.dynamics import MjxDynamics
+    from mjx_drax.physics.mjx_model import constraint_rows
+    from mjx_drax.solution.solve import solve
+
+    assert isinstance(problem.dynamics, MjxDynamics)
+    host = problem.dynamics.mj_model
+    solution = solve(problem, chains, seed, progress=False)
     best, certificate = solution.best_chain, solution.certificate
-    return row | {
+    return {
+        "nq": host.nq,
+        "nv": host.nv,
+        "nu": host.nu,
+        "rows": constraint_rows(problem.dynamics.model),
+        "knots": problem.horizon,
         "certified": solution.certified,
         "success_rate": solution.success_rate,
         "cost": float(solution.cost[best]),

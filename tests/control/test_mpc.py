@@ -1,5 +1,6 @@
 """Model predictive control: shifting, falling back, and the loop with MuJoCo's C engine."""
 
+import copy
 import json
 import time
 from dataclasses import replace
@@ -26,6 +27,7 @@ from mjx_drax.control import mpc
 from mjx_drax.control import trials as loop
 from mjx_drax.control.plant import random_pushes
 from mjx_drax.control.shift import shifted
+from mjx_drax.physics.states import CONVERGED
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import advance, start
 
@@ -250,6 +252,15 @@ def test_the_plant_is_pushed_heavier_and_noisy(slider):
     np.testing.assert_allclose(off.std(0), 0.1, rtol=0.15)
     noisy.step(np.zeros(1))
     assert noisy.data.qvel[0] != 0.0
+
+
+def test_the_contact_solver_of_the_plant_converges(slider):
+    dynamics = slider.dynamics
+    early = copy.deepcopy(dynamics.mj_model)
+    early.opt.iterations, early.opt.ls_iterations = 1, 4
+    plant = Plant(replace(slider, dynamics=replace(dynamics, mj_model=early)))
+    assert plant.model.opt.iterations == CONVERGED["iterations"]
+    assert early.opt.iterations == 1
 
 
 def test_a_push_on_no_body_and_a_mass_of_nothing_are_refused(slider):

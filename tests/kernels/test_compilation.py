@@ -7,6 +7,7 @@ import sys
 import jax
 import pytest
 
+from mjx_drax.base.errors import DraxError
 from mjx_drax.kernels import compilation
 from mjx_drax.kernels.compilation import compiled
 
@@ -101,3 +102,11 @@ def test_the_log_of_xla_is_off_unless_the_user_turns_it_on(before, given, level)
     code = f"{before}import mjx_drax, os; print(os.environ[{name!r}])"
     done = subprocess.run([sys.executable, "-c", code], env=env, check=True, stdout=subprocess.PIPE)
     assert done.stdout.decode().strip() == level
+
+
+def test_memory_that_is_short_is_said_in_a_sentence():
+    with (
+        pytest.raises(DraxError, match=r"run one step \(.*\): try with fewer contacts"),
+        compilation.said_plainly("one step", "with fewer contacts"),
+    ):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 185 GB.")

@@ -1,0 +1,275 @@
+"""Small tasks for robots of other packages, from their files as they are shipped.
+
+    python -m mjx_drax.studies.robots [NAME ...] [--path DIR] [--chains N] [--seed S] [--out DIR]
+
+A file is sought by its path inside of its package (`TASKS`), as in hydrax/models/walker/scene.xml:
+below DIR, or where the package is installed. Nothing of a package is imported. A Markdown table
+says how many chains succeed, and whether the best one is certified by MuJoCo's C engine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.tree_util import Partial
+
+from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import write_json
+from mjx_drax.modelling.terms import Terms
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.mjcf import from_mjcf
+from mjx_drax.physics.motors import Actuators, add_motors
+from mjx_drax.physics.source import load
+from mjx_drax.problem.problem import Problem
+from mjx_drax.studies.third_party import HEADER, Row, line, solved
+
+
+def double_cart_pole(path: Path) -> Problem:
+    """Swings up."""
+    on = Terms(load(path))
+    upright = {"slider": 0.0, "hinge_1": math.pi, "hinge_2": 0.0}
+    return from_mjcf(
+        on.model,
+        horizon=3.0,
+        dt=0.03,
+        running_residual=on.control(weight=1e-2),
+        terminal_residual=on.posture(upright, weight=100.0) + on.velocity(weight=10.0),
+        goal=lambda data: data.site("tip").xpos[2] > 3.95 and np.abs(data.qvel).max() < 0.5,
+    )
+
+
+def walker(path: Path) -> Problem:
+    """Ends 0.4 m further, with its torso upright."""
+    on = Terms(load(path))
+    wanted = {"rootx": 0.4, "rootz": 0.0, "rooty": 0.0}
+    return from_mjcf(
+        on.model,
+        horizon=1.0,
+        dt=0.02,
+        running_residual=on.control(weight=1e-2) + on.velocity(weight=1e-4),
+        terminal_residual=on.posture(wanted, weight=100.0) + on.velocity(weight=0.1),
+        goal=lambda data: np.abs(data.qpos[:3] - [0.0, 0.4, 0.0]).max() < 0.1,
+    )
+
+
+def crane(path: Path) -> Problem:
+    """Puts its payload onto the target."""
+    on = Terms(load(path))
+    target = on.model.body("target").pos
+    return from_mjcf(
+        on.model,
+        horizon=3.0,
+        dt=0.05,
+        running_residual=on.control(weight=1e-3),
+        terminal_residual=on.site("payload_end", target, weight=100.0) + on.velocity(weight=1.0),
+        goal=lambda data: np.linalg.norm(data.site("payload_end").xpos - target) < 0.05,
+    )
+
+
+def pusht(path: Path) -> Problem:
+    """Pushes the T back by 3 cm and turns it by 0.3 rad."""
+    on = Terms(load(path))
+    wanted = {"T_x": 0.0, "T_y": 0.0, "T_z": 0.0}
+    return from_mjcf(
+        on.model,
+        horizon=1.5,
+        dt=0.03,
+        x_init=np.concatenate([[0.0, 0.03, 0.3, 0.0, 0.0], np.zeros(5)]),
+        running_residual=on.control(weight=1e-3),
+        terminal_residual=on.posture(wanted, weight=[1e3, 1e3, 10.0]),
+        goal=lambda data: np.all(np.abs(data.qpos[:3]) < [0.015, 0.015, 0.15]),
+    )
+
+
+def arm(start: Sequence[float], path: Path) -> Problem:
+    """Turns its hand by 70 degrees about the base, around a ball in the middle of the way."""
+    model, home = load(path), np.array(start)
+    turned = home + np.eye(len(home))[0] * np.deg2rad(70)
+    (_, middle, end), hand = _hands(model, np.linspace(home, turned, 3)), "right_hand"
+    on, half = Terms(model), 0.5 * np.ptp(model.actuator_ctrlrange, axis=1)
+    links = tuple(range(2, model.nbody))
+
+    def there(data: mujoco.MjData) -> bool:
+        off = np.linalg.norm(data.body(hand).xpos - end[0])
+        along = data.body(hand).xmat[[2, 5, 8]] @ _axes(end[1])[:, 2]
+        return bool(off < 0.02 and along > 0.99 and np.abs(data.qvel).max() < 0.3)
+
+    return from_mjcf(
+        model,
+        horizon=1.2,
+        dt=0.02,
+        x_init=np.concatenate([home, np.zeros(model.nv)]),
+        running_residual=on.control(weight=1e-2 / half**2) + on.velocity(weight=1e-3),
+        terminal_residual=on.body(hand, *end, weight=1e3) + on.velocity(weight=10.0),
+        inequality=Partial(_too_near, links, middle[0]),
+        contacts=False,
+        goal=there,
+    )
+
+
+def _too_near(links: tuple[int, ...], ball: np.ndarray, data: Any, u: Array) -> Array:
+    """How much nearer than 0.15 m to a ball the frames of links are [m], about."""
+    squared = jnp.sum((data.xpos[jnp.array(links)] - ball) ** 2, axis=1)
+    return (0.15**2 - squared) / 0.3
+
+
+def _hands(model: mujoco.MjModel, postures: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Position and quaternion of the hand in each posture (n, nq)."""
+    data, found = mujoco.MjData(model), []
+    for data.qpos[:] in postures:
+        mujoco.mj_kinematics(model, data)
+        found.append((data.body("right_hand").xpos.copy(), data.body("right_hand").xquat.copy()))
+    return found
+
+
+def _axes(quaternion: np.ndarray) -> np.ndarray:
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, quaternion)
+    return turn.reshape(3, 3)
+
+
+def legs(
+    posture: Mapping[str, float],
+    feet: str,
+    path: Path,
+    forward: float = 0.0,
+    bend: float = 1.0,
+    actuators: Actuators | None = None,
+) -> Problem:
+    """From a posture on the floor to the same posture, some way ahead or with bent legs."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
+    spec.option.gravity = [0, 0, -9.81]  # robosuite's files have none
+    if actuators is not None:
+        add_motors(spec, actuators, spec.modelname)
+    model = spec.compile()
+    start, end = (_standing(model, posture, feet, by) for by in (1.0, bend))
+    end[0] += forward
+    on = Terms(model)
+    weights = np.append(np.full(6, 300.0), np.full(model.nv - 6, 3.0))
+
+    def there(data: mujoco.MjData) -> bool:
+        upright = data.body(int(model.jnt_bodyid[0])).xmat[8] > 0.95
+        return bool(upright and np.abs(data.qpos[:3] - end[:3]).max() < 0.08)
+
+    return from_mjcf(
+        model,
+        horizon=0.8,
+        dt=0.02,
+        x_init=np.concatenate([start, np.zeros(model.nv)]),
+        running_residual=on.posture(end, weight=1e-3 * weights) + on.velocity(weight=1e-3),
+        terminal_residual=on.posture(end, weight=weights) + on.velocity(weight=1.0),
+        contacts=[(feet, "ground")],
+        goal=there,
+    )
+
+
+def _standing(
+    model: mujoco.MjModel, posture: Mapping[str, float], feet: str, by: float
+) -> np.ndarray:
+    """qpos (nq,) with `by` times the angles of joints whose names end so, feet on the ground."""
+    data, ground = mujoco.MjData(model), model.geom("ground").id
+    for j in range(1, model.njnt):
+        angle = next((a for end, a in posture.items() if model.joint(j).name.endswith(end)), 0.0)
+        data.qpos[model.jnt_qposadr[j]] = by * angle
+    data.qpos[2] = 2.0
+    mujoco.mj_kinematics(model, data)
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    down = [g for g, name in enumerate(names) if name and Path(name).match(feet)]
+    data.qpos[2] -= min(mujoco.mj_geomDistance(model, data, g, ground, 9.0, None) for g in down)
+    return data.qpos.copy()
+
+
+PANDA = (0.0, 0.2, 0.0, -2.2, 0.0, 2.4, 0.8)
+UR5E = (-0.47, -1.73, 2.3, -2.2, -1.59, 0.0)
+IIWA = (0.0, 0.65, 0.0, -1.6, 0.0, 0.8, 0.0)
+GO1 = {"_thigh_joint": 0.9, "_calf_joint": -1.8}
+SPOT = {"_hy_leg_joint": 0.8, "_kn_leg_joint": -1.6}
+G1 = {"_hip_pitch_joint": -0.31, "_knee_joint": 0.67, "_ankle_pitch_joint": -0.36}
+
+_ARMS, _LEGS = "robosuite/models/assets/robots", "mjlab/asset_zoo/robots"
+_go1 = partial(legs, GO1, "*_foot_collision", actuators={"position": 60.0})
+_spot = partial(legs, SPOT, "[FR][LR]")
+_g1 = partial(legs, G1, "*_foot*_collision", actuators={"position": 200.0})
+
+TASKS: dict[str, tuple[str, Callable[[Path], Problem]]] = {
+    "double_cart_pole": ("hydrax/models/double_cart_pole/scene.xml", double_cart_pole),
+    "walker": ("hydrax/models/walker/scene.xml", walker),
+    "crane": ("hydrax/models/crane/scene.xml", crane),
+    "pusht": ("hydrax/models/pusht/scene.xml", pusht),
+    "panda": (f"{_ARMS}/panda/robot.xml", partial(arm, PANDA)),
+    "ur5e": (f"{_ARMS}/ur5e/robot.xml", partial(arm, UR5E)),
+    "iiwa": (f"{_ARMS}/iiwa/robot.xml", partial(arm, IIWA)),
+    "go1_stand": (f"{_LEGS}/unitree_go1/xmls/go1.xml", _go1),
+    "go1_forward": (f"{_LEGS}/unitree_go1/xmls/go1.xml", partial(_go1, forward=0.3)),
+    "spot_stand": (f"{_ARMS}/spot/robot.xml", _spot),
+    "spot_forward": (f"{_ARMS}/spot/robot.xml", partial(_spot, forward=0.3)),
+    "g1_stand": (f"{_LEGS}/unitree_g1/xmls/g1.xml", _g1),
+    "g1_squat": (f"{_LEGS}/unitree_g1/xmls/g1.xml", partial(_g1, bend=1.8)),
+}
+"""The file of each task, by its path from the package's name on, and what makes the problem."""
+
+
+def model_file(inside: str, folder: Path | None = None) -> Path:
+    """Where a file of a package is: below a folder, or where the package is installed.
+
+    Raises:
+        DraxError: it is not there.
+    """
+    package, rest = inside.split("/", 1)
+    if folder is None:
+        spec = importlib.util.find_spec(package)
+        places = spec.submodule_search_locations if spec else None
+        found = [Path(place) / rest for place in places or []]
+    else:
+        found = sorted(folder.rglob(inside))
+    for path in found:
+        if path.is_file():
+            return path
+    raise DraxError(
+        f"there is no {inside} {f'below {folder}' if folder else 'installed'}: pip install "
+        f"{package}, or unpack it and give --path the folder that holds {package}/."
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Solve, print the table, write `robots.json`; 0 if every best chain is certified."""
+    parser = argparse.ArgumentParser(prog="python -m mjx_drax.studies.robots", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(TASKS)}")
+    parser.add_argument("--path", type=Path, metavar="DIR", help="where the packages' files lie")
+    parser.add_argument("--chains", type=int, default=16)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", metavar="DIR", help="where robots.json goes")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.names if name not in TASKS]
+    if unknown:
+        print(f"there is no task {', '.join(unknown)}: use {', '.join(TASKS)}.", file=sys.stderr)
+        return 2
+    rows: list[Row] = []
+    print(HEADER, flush=True)
+    for name in options.names or TASKS:
+        row: Row = {"model": name}
+        inside, make = TASKS[name]
+        try:
+            row |= solved(make(model_file(inside, options.path)), options.chains, options.seed)
+        except DraxError as error:
+            row |= {"refused": str(error)}
+        print(line(row), flush=True)
+        rows.append(row)
+        if options.out:
+            write_json(Path(options.out) / "robots.json", rows)
+    return 0 if all(row.get("certified") for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
