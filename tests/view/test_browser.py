@@ -86,7 +86,7 @@ def test_what_is_refused(slider, tmp_path, without, monkeypatch):
     with pytest.raises(DraxError, match="bug_trap has no MuJoCo model to show in a browser"):
         Html().check(load("bug_trap").make())
     without("viser")
-    with pytest.raises(DraxError, match=r'needs viser.*pip install "mjx-drax\[html\]"'):
+    with pytest.raises(DraxError, match=r'needs viser.*pip install "mjx-drax\[view\]"'):
         save_html(slider, tmp_path / "replay.html")
     monkeypatch.undo()
     pytest.importorskip("viser")
