@@ -30,7 +30,7 @@ from mjx_drax.physics.differences import PARTS, Change, differences, disabling, 
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, put_model
-from mjx_drax.physics.pairs import Contacts
+from mjx_drax.physics.pairs import Contacts, contact_pairs
 from mjx_drax.physics.source import binary
 from mjx_drax.physics.states import Engine, integrate, quiet, set_state
 
@@ -402,7 +402,9 @@ def _causes(
         changed = copy.deepcopy(model)
         for change in changes:
             change(changed)
-        return float(compare(changed, at, contacts, bounded).velocity.max())
+        # Named pairs cannot be found in a model without any contact.
+        left = contacts if list(contact_pairs(changed)) else False
+        return float(compare(changed, at, left, bounded).velocity.max())
 
     known = differences(model, contacts)
     if known:
