@@ -13,13 +13,14 @@ import sys
 from collections.abc import Sequence
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.cli import benchmark, check, export, list_tasks, mpc, reproduce, solve
+from mjx_drax.cli import benchmark, check, export, list_tasks, mpc, reproduce, solve, view
 
 COMMANDS = {
     "list": list_tasks,
     "check": check,
     "solve": solve,
     "mpc": mpc,
+    "view": view,
     "export": export,
     "benchmark": benchmark,
     "reproduce": reproduce,

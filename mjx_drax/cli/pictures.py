@@ -63,8 +63,6 @@ def write_video(solution: Solution, folder: Path, draw: Any, look: dict[str, Any
     if not solution.certified:
         render(solution, folder / "plan.mp4", draw=draw, plan=True, **look)
         written.append("plan.mp4")
-    if model is None:
-        return written
     still = {name: look[name] for name in ("camera", "size") if name in look}
-    render_timelapse(solution, folder / "timelapse.png", **still)
+    render_timelapse(solution, folder / "timelapse.png", draw=draw, **still)
     return [*written, "timelapse.png"]

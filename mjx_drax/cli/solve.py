@@ -8,7 +8,7 @@ all bounds and constraints. It is also optimal if its residual is below a tolera
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
+from contextlib import ExitStack, suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -80,6 +80,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also film plan and replay beside each other: comparison.mp4",
     )
+    add(
+        "--live",
+        nargs="?",
+        type=int,
+        const=8080,
+        metavar="PORT",
+        help="show the knots in a browser while the solve runs, then the answer until Ctrl-C; "
+        "default port 8080",
+    )
     export.add_flags(parser)
     add(
         "--set",
@@ -143,12 +152,14 @@ def run(options: argparse.Namespace) -> int:
         tasks.full_name(options.task)  # answers at once, before heavy imports
     import jax
 
-    with jax.enable_x64(True) if options.precision == 64 else nullcontext():
-        return _run(options)
+    with ExitStack() as stack:
+        if options.precision == 64:
+            stack.enter_context(jax.enable_x64(True))
+        return _run(options, stack)
 
 
-def _run(options: argparse.Namespace) -> int:
-    """The same, in the precision that JAX has now."""
+def _run(options: argparse.Namespace, stack: ExitStack) -> int:
+    """The same, in the precision that JAX has now; `stack` closes what it opens."""
     problem, solver, chains, draw = _asked(options)
     from mjx_drax.search.restarts import settled
     from mjx_drax.solution import save as results
@@ -170,6 +181,12 @@ def _run(options: argparse.Namespace) -> int:
         require_drawing(problem, draw=None if options.side_by_side else draw, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)
     tell = say_nothing if options.quiet or options.json else say
+    record: Any = 1 if film else None
+    if options.live is not None:
+        from mjx_drax.view.viewer import live_page
+
+        page = live_page(problem, port=options.live, every=record or 5, told=tell)
+        record = stack.enter_context(page)
 
     if options.checkpoint is not None and Path(options.checkpoint).expanduser().exists():
         tell(f"going on from {options.checkpoint}")
@@ -180,7 +197,7 @@ def _run(options: argparse.Namespace) -> int:
         options.seed,
         solver,
         progress=not options.quiet,
-        record=1 if film else None,
+        record=record,
         checkpoint=options.checkpoint,
         tolerances=tolerances,
         **polish,
@@ -213,6 +230,10 @@ def _run(options: argparse.Namespace) -> int:
         tell(f"there from an earlier solve: {', '.join(older)}")
     if options.json and not options.quiet:
         print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
+    if options.live is not None:
+        tell("the page shows the answer; Ctrl-C ends it")
+        with suppress(KeyboardInterrupt):
+            record.play(solution)
     return 0 if solution.certified else 1
 
 

@@ -37,7 +37,7 @@ def solve(
     solver: Langevin | Restarts | None = None,
     guess: Trajectory | Solution | None = None,
     progress: Progress | bool | None = None,
-    record: int | None = None,
+    record: int | Recorder | None = None,
     devices: int = 1,
     checkpoint: str | os.PathLike[str] | None = None,
     tolerances: Tolerances | None = None,
@@ -66,6 +66,7 @@ def solve(
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for
             `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
             and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
+            A recorder instead of a number takes the snapshots itself, as `viewer.Live` does.
         devices: how many of this process to spread the chains over, evenly; the answer is the
             same. Each compiles the program for itself, all at once.
         checkpoint: a file to write every half minute, and to go on from where it is there, after
@@ -97,7 +98,8 @@ def solve(
         tolerances = as_tolerances(tolerances)
         tolerances.of(problem)  # refuses those of another size
         settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
-        recorder = None if record is None else Recorder(record)
+        if record is not None and not isinstance(record, Recorder):
+            record = Recorder(record)
         given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess
         search = Search(
             Family.of_one(problem),
@@ -107,13 +109,13 @@ def solve(
             mesh=mesh_for(chains, devices),
             guess=given,
             checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
-            recorder=recorder,
+            recorder=record,
         )
         with report as search.progress, said_plainly(f"the solve of {problem.name}"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
         solution = _certified(problem, settings, seed, found, interrupted, tolerances)
-    return solution if recorder is None else replace(solution, recording=recorder.recording())
+    return solution if record is None else replace(solution, recording=record.recording())
 
 
 def warm_of(solution: Solution, problem: Problem, chains: int) -> Warm:

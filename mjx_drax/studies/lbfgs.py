@@ -1,8 +1,9 @@
-"""A quasi-Newton baseline: L-BFGS on the augmented Lagrangian.
+"""Quasi-Newton baselines: L-BFGS and BFGS on the augmented Lagrangian.
 
-The metric M^{-1} is the limited-memory BFGS approximation of the inverse Hessian of L_mu, built
-from the last steps s and gradient changes y (two-loop recursion; Nocedal and Wright, Numerical
-Optimization, algorithm 7.4). It is meant for noise-free use with the line search of the tail,
+The metric M^{-1} is an approximation of the inverse Hessian of L_mu, built from steps s and
+gradient changes y: from the last ones (two-loop recursion; Nocedal and Wright, Numerical
+Optimization, algorithm 7.4), or in a full matrix (equation 6.17 there). Both are meant for
+noise-free use with the line search of the tail,
 
     Langevin(iterations=0, tail=1000, preconditioner=LBFGS())
 
@@ -72,7 +73,7 @@ class LBFGS(Metric):
         steepest = super().direction(problem, model, key, memory)
         gradient, back = ravel_pytree(model.gradient)
         memory = self._remember(problem, memory, model.trajectory, gradient)
-        drift = back(-_inverse_times(memory, gradient))
+        drift = back(-self._inverse_times(memory, gradient))
         update = memory.count == self.inner
         rate = jax.tree.map(lambda r: jnp.where(update, 0.5 * r, 0.0), steepest.multipliers)
         memory = replace(
@@ -84,26 +85,78 @@ class LBFGS(Metric):
         return replace(steepest, drift=drift, multipliers=rate, memory=memory)
 
     def _remember(
-        self, problem: Problem, memory: Memory, trajectory: Trajectory, gradient: Array
-    ) -> Memory:
+        self, problem: Problem, memory: Any, trajectory: Trajectory, gradient: Array
+    ) -> Any:
         """The memory with the last step's pair, if lambda stood still and s'y is positive."""
         change = jax.tree.map(jnp.subtract, trajectory, memory.point)
         x = jax.vmap(problem.dynamics.difference)(trajectory.x, memory.point.x)
         s, y = ravel_pytree(replace(change, x=x))[0], gradient - memory.gradient
         product = jnp.dot(s, y)
         good = (memory.count > 0) & (product > 1e-6 * jnp.dot(s, s))
+        memory = replace(memory, count=memory.count + 1)
+        return self._with_pair(memory, s, y, jnp.where(good, product, 1.0), good)
+
+    def _with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
+        """The memory with a pair of which s'y is `product`, if it is good."""
 
         def push(rows: Array, new: Array) -> Array:
             return jnp.where(good, jnp.concatenate([rows[1:], new[None]]), rows)
 
-        return Memory(
-            push(memory.s, s),
-            push(memory.y, y),
-            push(memory.curvature, 1.0 / jnp.where(good, product, 1.0)),
-            memory.point,
-            memory.gradient,
-            memory.count + 1,
+        return replace(
+            memory,
+            s=push(memory.s, s),
+            y=push(memory.y, y),
+            curvature=push(memory.curvature, 1.0 / product),
         )
+
+    def _inverse_times(self, memory: Any, gradient: Array) -> Array:
+        """M^{-1} times the gradient (n,)."""
+        return _inverse_times(memory, gradient)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Matrix:
+    """M^{-1} (n, n), and whether it has met a pair; the rest as in `Memory`."""
+
+    inverse: Array
+    began: Array
+    point: Trajectory
+    gradient: Array
+    count: Array
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class BFGS(LBFGS):
+    """Drift -M^{-1} grad L_mu with the full matrix M^{-1} of BFGS; `pairs` has no meaning here.
+
+    M^{-1} <- (I - s y'/s'y) M^{-1} (I - y s'/s'y) + s s'/s'y. A chain takes n² numbers.
+    """
+
+    def memory(self, problem: Problem, trajectory: Trajectory) -> Any:
+        """The identity."""
+        zero = ravel_pytree(problem.no_change(trajectory))[0]
+        none = jnp.zeros((), jnp.int32)
+        return Matrix(jnp.eye(zero.shape[0]), jnp.zeros((), bool), trajectory, zero, none)
+
+    def _with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
+        scale = product / jnp.maximum(jnp.dot(y, y), 1e-30)  # of the first matrix
+        inverse = jnp.where(memory.began, memory.inverse, scale * memory.inverse)
+        moved = inverse @ y
+        factor = (1.0 + jnp.dot(y, moved) / product) / product
+        cross = jnp.outer(moved, s) / product
+        new = inverse + factor * jnp.outer(s, s) - cross - cross.T
+        return replace(
+            memory,
+            inverse=jnp.where(good, new, memory.inverse),
+            began=memory.began | good,
+        )
+
+    def _inverse_times(self, memory: Any, gradient: Array) -> Array:
+        """M^{-1} times the gradient; before the first pair a step of unit length."""
+        length = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
+        return jnp.where(memory.began, memory.inverse @ gradient, gradient / length)
 
 
 def _inverse_times(memory: Memory, gradient: Array) -> Array:

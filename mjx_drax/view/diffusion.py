@@ -124,7 +124,7 @@ def render_diffusion(
     times = problem.times[: len(states)]
     film = Film(
         shown=shown,
-        colors=Colors.of(shown[0]),
+        colors=Colors.of(shown[0].defects[0]),
         moments=moments,
         states=states,
         times=times,
@@ -221,9 +221,8 @@ class Colors:
     worst: float
 
     @staticmethod
-    def of(history: ChainHistory) -> Colors:
-        """The scale for a chain: up to the next power of ten above its first defects."""
-        first = history.defects[0]
+    def of(first: Floats) -> Colors:
+        """The scale for a chain: up to the next power of ten above its first defects (K,)."""
         worst = np.max(first[np.isfinite(first)], initial=10.0 * FEASIBLE)
         return Colors(float(10.0 ** np.ceil(np.log10(worst) - 0.3)))
 

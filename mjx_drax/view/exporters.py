@@ -20,11 +20,11 @@ class Html(Exporter):
     """The best chain's replay as one HTML file."""
 
     name, file = "html", "replay.html"
-    summary = 'the replay for any browser, one file; pip install "mjx-drax[html]"'
+    summary = 'the replay for any browser, one file; pip install "mjx-drax[view]"'
 
     def check(self, problem: Problem) -> None:
         """Complain about a problem without a model, or if viser is not installed."""
-        from mjx_drax.view.browser import require_viewer
+        from mjx_drax.view.browser_scene import require_viewer
 
         require_viewer(problem)
 

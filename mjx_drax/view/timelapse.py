@@ -12,6 +12,7 @@ from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.states import interpolated
+from mjx_drax.view.drawing import Canvas
 from mjx_drax.view.frames import even_size
 from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import FREE, Scene, camera_for
@@ -19,6 +20,7 @@ from mjx_drax.view.video import states_of
 
 if TYPE_CHECKING:
     from mjx_drax.solution.solution import Solution
+    from mjx_drax.view.drawing import Draw
 
 _FIRST_OPACITY, _LAST_OPACITY = 0.12, 0.65  # of the poses before the last one, which is opaque
 
@@ -32,33 +34,45 @@ def render_timelapse(
     camera: str | int | None = None,
     chain: int | None = None,
     plan: bool = False,
+    draw: Draw | None = None,
 ) -> Path:
     """One picture of a chain's motion as it was replayed: ghosts, and the last pose.
 
     Ghosts are translucent copies of the robot, equally far apart in time, the fainter the earlier.
 
     Args:
-      solution: from `solve`, of a problem with a model.
+      solution: from `solve`.
       path: where to, ending in .png; its folder is made if need be.
       count: number of poses, the last one included.
       size: (width, height) [pixels].
       camera: a camera of the model, see `motion_frames`; None frames the motion.
       chain, plan: as in `render`: the best chain by default, and its plan instead of the replay.
+      draw: as in `render`, for problems without a model: the picture is what it draws of the whole
+        motion, and `count` and `camera` have no meaning.
 
     Raises:
-      DraxError: a path, size, count, camera or chain that cannot be used, or no model.
+      DraxError: a path, size, count, camera or chain that cannot be used, or neither a model nor
+        `draw`.
     """
     from PIL import Image
 
     width, height = even_size(size)
     require_whole("count", count)
-    model = mujoco_model(solution.problem.dynamics)
+    model, which = mujoco_model(solution.problem.dynamics), solution.chain_or_best(chain)
+    states = states_of(solution, which, plan)
     if model is None:
-        raise DraxError(
-            f"{solution.problem.name} has no model to show: make the problem with from_mjcf."
-        )
-    which = solution.chain_or_best(chain)
-    qpos = states_of(solution, which, plan)[:, : model.nq]
+        if draw is None:
+            raise DraxError(
+                f"{solution.problem.name} has no model to show: make the problem with from_mjcf, "
+                "or give draw=."
+            )
+        canvas = Canvas(height, width, layout="constrained")
+        draw(canvas.figure.add_subplot(), states)
+        canvas.agg.draw()
+        with complete(path, (".png",)) as partial:
+            Image.fromarray(canvas.pixels()).save(partial)
+        return file_path(path)
+    qpos = states[:, : model.nq]
     times = solution.times_of(which)[: len(qpos)]
     seen_by = camera_for(model, qpos, FREE if camera is None else camera, width / height)
     scene = Scene(model, seen_by)

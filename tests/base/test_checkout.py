@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,13 @@ def test_a_checkout_has_its_tasks_and_models_and_no_other_folder(tmp_path):
     found = run(tmp_path, "")  # installed for development
     assert found.returncode == 0, found.stderr
     assert Path(found.stdout.strip()).parent == ROOT / "mjx_drax"
+
+
+def test_every_folder_of_the_library_is_installed():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    files = (ROOT / "mjx_drax").rglob("*.py")
+    folders = {".".join(file.parent.relative_to(ROOT).parts) for file in files}
+    assert folders | {"mjx_drax.tasks", "mjx_drax.models"} == set(settings["packages"])
 
 
 @pytest.mark.slow

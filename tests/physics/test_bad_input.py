@@ -1,5 +1,7 @@
 """Bad models, and bad arguments and functions of `from_mjcf`, give one clear error."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -7,6 +9,8 @@ import pytest
 from builders import BALL, INF, NAN, At, arm, assert_complains, cases, robot
 
 from mjx_drax import Smoothed, from_mjcf, solve
+from mjx_drax.physics import checks
+from mjx_drax.physics.pairs import left_out
 from mjx_drax.physics.report import check
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")
@@ -146,3 +150,18 @@ FUNCTIONS = [
 )
 def test_bad_input_gives_one_clear_error(call, words, tmp_path):
     assert_complains(lambda: call(At(tmp_path)), words)
+
+
+def test_a_cause_is_looked_for_with_pairs_of_contacts_that_are_named(monkeypatch):
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/>"
+        "<body pos='0 0 1'><freejoint/><geom name='ball' size='0.1'/></body></worldbody></mujoco>"
+    )
+
+    def compare(changed, at, contacts, bounded):
+        left_out(changed, contacts)  # refuses pairs that cannot touch
+        return SimpleNamespace(velocity=np.ones(1))
+
+    monkeypatch.setattr(checks, "compare", compare)
+    cause = checks._causes(model, None, [("ball", "floor")], np.zeros(0), 1.0)
+    assert cause == "the reason is not known"

@@ -86,7 +86,7 @@ def test_what_is_refused(slider, tmp_path, without, monkeypatch):
     with pytest.raises(DraxError, match="bug_trap has no MuJoCo model to show in a browser"):
         Html().check(load("bug_trap").make())
     without("viser")
-    with pytest.raises(DraxError, match=r'needs viser.*pip install "mjx-drax\[html\]"'):
+    with pytest.raises(DraxError, match=r'needs viser.*pip install "mjx-drax\[view\]"'):
         save_html(slider, tmp_path / "replay.html")
     monkeypatch.undo()
     pytest.importorskip("viser")
@@ -123,7 +123,8 @@ def test_a_browser_shows_it_and_scrubs(page):
             return shots[-1]
 
         nothing = tab.screenshot(clip={"x": 0, "y": 150, "width": 640, "height": 280})
-        start = seen(0.02, [nothing])
+        middle = seen(0.5, [nothing])  # a page plays by itself until it is clicked
+        start = seen(0.02, [nothing, middle])
         end = seen(0.98, [nothing, start])
         shown = float(tab.get_attribute("[role=slider]", "aria-valuenow"))
         assert "reaches the goal" in tab.inner_text("#drax")

@@ -213,6 +213,14 @@ def test_timelapse(cartpole: Solution, tmp_path: Path) -> None:
     assert 0 < np.abs(pictures[2] - pictures[1]).mean() < np.abs(pictures[6] - pictures[1]).mean()
 
 
+def test_a_task_without_a_model_draws_its_timelapse(trapped: Solution, tmp_path: Path) -> None:
+    drawn = []
+    picture = {"size": (160, 120), "draw": lambda axes, states: drawn.append(states)}
+    with Image.open(render_timelapse(trapped, tmp_path / "a.png", **picture)) as image:
+        assert image.size == (160, 120)
+    assert len(drawn[0]) == trapped.problem.horizon + 1
+
+
 def test_what_has_no_timelapse(cartpole: Solution, trapped: Solution, tmp_path: Path) -> None:
     with pytest.raises(DraxError, match="no model"):
         render_timelapse(trapped, tmp_path / "a.png")

@@ -12,6 +12,7 @@ from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
+from mjx_drax.studies.lbfgs import BFGS
 from mjx_drax.studies.reproduce import settings
 from mjx_drax.studies.reproduce.output import (
     Numbers,
@@ -84,10 +85,12 @@ def make(
 def _methods(budget: int, longer: int) -> dict[str, Langevin]:
     """The methods that are compared, each with a budget of iterations."""
     flow, diffusion = settings.TRAP_FLOW, with_budget(settings.TRAP, budget)
+    full = replace(settings.TRAP_QUASI_NEWTON, preconditioner=BFGS())
     solvers = replace(flow, noise=NO_NOISE), settings.TRAP_QUASI_NEWTON, flow
     first_order = dict(zip(FIRST_ORDER, solvers, strict=True))
     return {
         **{name: with_budget(solver, budget) for name, solver in first_order.items()},
+        "quasi-Newton, full matrix": with_budget(full, budget),
         "preconditioned, no noise": replace(diffusion, noise=NO_NOISE),
         "preconditioned diffusion": diffusion,
         **{
