@@ -75,9 +75,6 @@ LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
 HALF, SHORT = 0.5, 0.25
 """Where curvature is learned: steps up to HALF keep the damping, steps up to SHORT raise it."""
 
-IDLE = 0.1
-"""The barrier falls where the model promises less than this share of what its weight costs."""
-
 INSIDE = 0.99
 """Share of the way to their bounds that controls may be moved to bend a step."""
 
@@ -311,7 +308,7 @@ def _moved(
     assert v is not None  # for the type checker
     assert derivatives is not None
     ends = slacks_of(problem, knots)
-    rho = _barrier(problem, knots, v, now, residual, polish, scales)
+    rho = _barrier(problem, knots, v, now.barrier, residual, polish, scales)
 
     central = _central(problem, knots, rho)
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
@@ -393,7 +390,7 @@ def _barrier(
     problem: Problem,
     knots: Trajectory,
     v: Sides,
-    now: Progress,
+    rho: Array,
     residual: Residual,
     polish: Polish,
     scales: Scales,
@@ -401,20 +398,18 @@ def _barrier(
     """rho, lower where the barrier's problem is nearly solved; at most two steps down.
 
     It is if slopes, defects and gaps are below ten times rho, as costs; or if the residual's other
-    parts are small, and below what the bounds' part is at this rho; or if the last model promised
-    to gain far less than the barrier costs.
+    parts are small, and below what the bounds' part is at this rho.
     """
     gaps = jax.tree.leaves(products(problem, knots, v))
     count = jnp.maximum(sum((jnp.sum(p > 0.0) for p in gaps), start=jnp.zeros((), int)), 1)
     floor = 0.1 * polish.tolerance * scales.cost / count
-    others, rho = residual.others, now.barrier
+    others = residual.others
     for _ in range(2):
         off = [jnp.abs(jnp.where(p > 0.0, p - rho, 0.0)).max(initial=0.0) for p in gaps]
         centred = jnp.max(jnp.stack(off)) < 10.0 * rho
         small = (others < NEAR) & (others < count * rho / scales.cost)
         lower = jnp.minimum(0.2 * rho, scales.terms * (rho / scales.terms) ** 1.5)
-        idle = now.promise < IDLE * count * rho / scales.cost
-        falls = centred & ((residual.error < 10.0 * rho) | small | idle)
+        falls = centred & ((residual.error < 10.0 * rho) | small)
         rho = jnp.where(falls, jnp.maximum(lower, floor), rho)
     return jnp.maximum(rho, floor)
 

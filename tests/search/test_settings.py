@@ -84,7 +84,11 @@ def test_an_end_that_was_final_stays_so():
         ("polish", "1e-6", "polish is '1e-6': give one of Polish, or MODULE"),
         ("flow.noise", "hot", r"give a number, Geometric\(start, end\)"),
         ("flow.noise.start", "hot", "give a number"),
-        ("flow.preconditioner", "Newton", "give one of Diagonal, GaussNewton, Identity, LBFGS"),
+        (
+            "flow.preconditioner",
+            "Newton",
+            "give one of BFGS, Diagonal, GaussNewton, Identity, LBFGS",
+        ),
     ],
 )
 def test_what_is_refused(name, text, words):
