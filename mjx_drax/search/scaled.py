@@ -1,8 +1,9 @@
 """Gauss-Newton's step in coordinates without units, as the default flow takes it.
 
 The penalty mu |h|^2 and the damping delta |dz|^2 add up numbers of different units. So the flow
-measures each state in sixths of the box that initial knots are drawn from, and each control in
-halves: x = S x', u = U u'. In these coordinates
+measures each state in a sixth or a twelfth of the box that initial knots are drawn from (as
+`Restarts.states` says for the attempt), and each control in halves: x = S x', u = U u'. In these
+coordinates
 
     A' = S^-1 A S    B' = S^-1 B U    h' = S^-1 h    lambda' = S lambda    g' = S g    H' = S H S
 
@@ -26,8 +27,8 @@ from mjx_drax.method.model import Derivatives, Linearization, Model, Multipliers
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 
-STATES, CONTROLS = 6.0, 2.0
-"""Widths of the box of initial knots, in the coordinates of the flow."""
+CONTROLS = 2.0
+"""How many units a control's box is wide."""
 
 
 @register_dataclass
@@ -90,7 +91,8 @@ def without_units(flow: Langevin, problem: Problem) -> Langevin:
     if not isinstance(metric, GaussNewton):
         return flow
     of_x, of_u = widths(problem)
-    x, u = jnp.where(of_x > 0.0, of_x / STATES, 1.0), jnp.where(of_u > 0.0, of_u / CONTROLS, 1.0)
+    x = jnp.where(of_x > 0.0, of_x / flow.scale.states, 1.0)
+    u = jnp.where(of_u > 0.0, of_u / CONTROLS, 1.0)
     return replace(flow, preconditioner=Scaled(metric, x, u))
 
 
