@@ -18,7 +18,7 @@ from mjx_drax import tasks
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
-    *(page for page in sorted((ROOT / "docs").glob("*.md")) if page.name != "README.md"),
+    *sorted((ROOT / "docs").glob("*.md")),
     *(ROOT / name for name in ("CONTRIBUTING.md", "CHANGELOG.md")),
 ]
 
@@ -51,7 +51,7 @@ def linked(page: Path) -> str:
             return f"[{text}]({'index.md' if name == 'README.md' else name}{anchor or ''})"
         return text if text.startswith("`") else f"`{target.removeprefix('../')}`"
 
-    text = page.read_text(encoding="utf-8").replace("docs/README.md", "README.md")
+    text = page.read_text(encoding="utf-8")
     return re.sub(r"\[([^\]]*)\]\(([^)#]*)(#[^)]*)?\)", changed, text)
 
 
