@@ -7,11 +7,16 @@ pendulum whose physics keeps energy.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from mjx_drax import Problem, from_function
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 DT = 0.1  # [s]
 CHAINS = 256
@@ -49,3 +54,11 @@ def running(x: Array, u: Array) -> Array:
 def terminal(x: Array) -> Array:
     """Half its squared norm is 10 angle^2 + velocity^2."""
     return jnp.sqrt(jnp.array([20.0, 2.0])) * x
+
+
+def draw(axes: Axes, states: np.ndarray) -> None:
+    """The phase portrait: velocity over angle so far (K + 1, 2), and upright as a star."""
+    axes.plot(0.0, 0.0, "*", color="#2a9d5c", markersize=20, zorder=3)
+    axes.plot(states[:, 0], states[:, 1], "-", color="#1f6fb2", linewidth=2)
+    axes.plot(*states[-1], "o", color="#d9541e", markersize=12, zorder=4)
+    axes.set(xlim=(-7, 7), ylim=(-7, 7), xlabel="angle [rad]", ylabel="velocity [rad/s]")

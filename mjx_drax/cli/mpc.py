@@ -18,18 +18,22 @@ from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "chains": (at_least_1, 8, "number of chains; default 8"),
     "explorers": (int, None, "how many of them explore; default half"),
-    "iterations": (at_least_1, 2, "of every chain for a plan; default 2"),
+    "iterations": (at_least_1, 2, "iterations of every chain for a plan; default 2"),
     "every": (at_least_1, 1, "control steps between two plans; default 1"),
     "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),
-    "horizon": (float, None, "of a plan [s]; default the task's"),
-    "duration": (float, None, "of a run [s]; default the horizon and 8 more"),
-    "runs": (at_least_1, 10, "default 10"),
-    "pushes": (int, 2, "in every run; default 2"),
-    "push": (float, 1.0, "size of a push, as a velocity of the body pushed [m/s]; default 1"),
+    "horizon": (float, None, "duration of a plan [s]; default the task's"),
+    "duration": (float, None, "duration of a run [s]; default the horizon and 8 more"),
+    "runs": (at_least_1, 10, "number of runs; default 10"),
+    "pushes": (int, 2, "number of pushes in every run; default 2"),
+    "push": (float, 1.0, "velocity that a push gives to the body it pushes [m/s]; default 1"),
     "mass": (float, 1.0, "factor on the masses of the simulated model; default 1"),
     "noise": (float, 0.0, "standard deviation of measured states; default 0"),
-    "shaking": (float, 0.0, "random changes of velocities in a second; default 0"),
-    "seed": (int, 0, "default 0"),
+    "shaking": (
+        float,
+        0.0,
+        "standard deviation of random changes of velocities in a second; default 0",
+    ),
+    "seed": (int, 0, "of the random numbers; default 0"),
 }
 """Type, default and help."""
 

@@ -1,4 +1,14 @@
-"""Make a figure or table of the paper again: writes NAME.png and NAME.json."""
+"""Make a figure or table of the paper again: writes NAME.png and NAME.json.
+
+phase-portrait           figure 2: random knots become a swing-up
+convergence              figure 3: |h|^2 for several penalties
+bug-trap                 figure 4: gradient descent, quasi-Newton and diffusion
+parallel-table           table I: many pendulums at once
+multipliers              |h|^2 with and without multipliers
+theorem-2                mu*, stable steps, and the energy of the proof
+direct-against-shooting  pendulums from random states
+open-questions           metrics, annealing, sampled gradients
+"""
 
 from __future__ import annotations
 
@@ -11,22 +21,27 @@ from mjx_drax.studies import reproduce
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Which figure, its size, and where to."""
     parser.add_argument(
-        "name", metavar="NAME", choices=reproduce.NAMES, help=", ".join(reproduce.NAMES)
+        "name", metavar="NAME", choices=reproduce.NAMES, help="one of the names above"
     )
-    parser.add_argument("--out", metavar="DIR", default="out/reproduce")
     parser.add_argument(
-        "--chains", type=at_least_1, metavar="N", help="number of chains; at most so many problems"
+        "--out", metavar="DIR", default="out/reproduce", help="default out/reproduce"
+    )
+    parser.add_argument(
+        "--chains",
+        type=at_least_1,
+        metavar="N",
+        help="number of chains; parallel-table leaves out larger N",
     )
     parser.add_argument(
         "--iterations",
         type=at_least_1,
         metavar="K",
-        help="instead of the published or usual number",
+        help="number of iterations, instead of the usual one",
     )
     parser.add_argument(
         "--full",
         action="store_true",
-        help="the sizes of the paper, for a GPU; without it some ten minutes on two CPU cores",
+        help="the sizes of the paper, for a GPU; without it less than ten minutes on two CPU cores",
     )
 
 

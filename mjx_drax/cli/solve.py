@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="iterations with noise of an attempt; those without noise change in proportion",
     )
-    add("--seed", type=int, default=0, metavar="S", help="default 0")
+    add("--seed", type=int, default=0, metavar="S", help="of the random numbers; default 0")
     add("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
     add("--out", metavar="DIR", help="default out/TASK")
     add(
@@ -120,7 +120,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--max-iterations",
         type=at_least_1,
         metavar="N",
-        help="at most so many of the polish, which makes the residual small; default 200",
+        help="most iterations of the polish, Newton steps at the end; default 200",
     )
     add(
         "--precision",

@@ -80,7 +80,7 @@ def render(
     chain = solution.chain_or_best(chain)
     states = states_of(solution, chain, plan)
     times = solution.times_of(chain)[: len(states)]
-    overlay = outcome_lines(solution, chain, plan) if caption else []
+    overlay = outcome_lines(solution, chain, plan, brief=True) if caption else []
     model = mujoco_model(solution.problem.dynamics)
     if model is not None:
         qpos, look = states[:, : model.nq], {"size": size, "camera": camera, "speed": speed}
@@ -113,7 +113,7 @@ def render_comparison(
     assert model is not None  # as checked
     chain = solution.chain_or_best(chain)
     width, height = even_size(size)
-    told = outcome_lines(solution, chain)
+    told = outcome_lines(solution, chain, brief=True)
     overlay = [told[0], "left: plan, right: replay", *told[1:]]
     below = caption_height([overlay], height, width)
     half = 2 * (width // 4)
@@ -242,13 +242,16 @@ def states_of(solution: Solution, chain: int, plan: bool) -> np.ndarray:
     return finite(solution.replays_in(solution.mode_of(chain)).states[chain])
 
 
-def outcome_lines(solution: Solution, chain: int | None = None, plan: bool = False) -> list[str]:
+def outcome_lines(
+    solution: Solution, chain: int | None = None, plan: bool = False, brief: bool = False
+) -> list[str]:
     """Short texts about a chain, for a caption.
 
     Args:
       solution: from `solve`.
       chain: the best one by default.
       plan: say what the plan breaks, not what came of its replay.
+      brief: of a certified chain's replay no more than its cost and the verdict.
     """
     chain = solution.best_chain if chain is None else chain
     problem, mode, where = solution.problem, solution.mode_of(chain), None
@@ -270,7 +273,13 @@ def outcome_lines(solution: Solution, chain: int | None = None, plan: bool = Fal
         told,
         "t = {time}",
     ]
-    if not solution.certified_chains[chain]:
+    certified = bool(solution.certified_chains[chain])
+    if brief and certified and not plan:
+        optimal = solution.status[chain] == "optimal"
+        verdict = "certified and optimal" if optimal else "certified"
+        told = told.partition(",")[0]  # without its distance from the plan
+        return [problem.name, "t = {time}", f"cost {cost:.3g}", verdict, f"{mode}: {told}"]
+    if not certified:
         infeasible = "the plan is infeasible"
         reason = "no replay succeeds" if solution.feasible[chain] else infeasible
         lines.insert(1, f"{UNCERTIFIED}: {reason}")

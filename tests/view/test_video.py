@@ -255,6 +255,13 @@ def test_overlay_says_what_is_certified(
         assert ("residual not known" if solution is cartpole else known) in lines
         assert "bound violation 0" in lines
         assert f"{lines[-3]} {lines[-2]}".startswith(f"{engine}, {mode}, ")
+        brief = video.outcome_lines(judged, brief=True)
+        if judged.certified:
+            cost = f"cost {judged.replay_cost[judged.best_chain]:.3g}"
+            verdict = "certified" if solution is cartpole else "certified and optimal"
+            assert brief == [lines[0], lines[-1], cost, verdict, mode]
+        else:
+            assert brief == lines
         assert lines[-1] == "t = {time}"
 
 
