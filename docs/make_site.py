@@ -32,8 +32,10 @@ def write(source: Path) -> None:
     (source / "index.md").write_text(linked(ROOT / "README.md"), encoding="utf-8")
     (source / "reference.md").write_text(reference(), encoding="utf-8")
     (source / "gallery.md").write_text(gallery(), encoding="utf-8")
-    for picture in (ROOT / "docs").glob("*.webp"):
-        shutil.copy(picture, source)
+    for picture in (ROOT / "docs").rglob("*.webp"):
+        target = source / picture.relative_to(ROOT / "docs")
+        target.parent.mkdir(exist_ok=True)
+        shutil.copy(picture, target)
 
 
 def linked(page: Path) -> str:
@@ -68,28 +70,28 @@ def reference() -> str:
 
 
 def gallery() -> str:
-    """Every task: what it is, how to solve it, and the code that states it."""
+    """Every task: its poster, how to solve it, and the code that states it."""
     lines = [
         "# Gallery",
         "",
-        "All tasks of `mjx-drax list`. Each is one file that states a problem; the code below is",
-        "its function `make`. The command writes a video, a film and plots into `out/TASK`.",
+        "All tasks of `mjx-drax list`. A picture shows the replay of an answer; the fainter a pose,",
+        "the earlier it is. Each task is one file that states a problem; the code is its function",
+        "`make`. The command writes a video, a film, pictures and plots into `out/TASK`.",
         "",
     ]
     for name in tasks.names():
-        path = ROOT / "tasks" / f"{name}.py"
-        text = path.read_text(encoding="utf-8")
-        make = next(
-            node
-            for node in ast.parse(text).body
-            if isinstance(node, ast.FunctionDef) and node.name == "make"
-        )
-        film = f"{name}.webp"
+        file = ROOT / "tasks" / f"{name}.py"
+        text = file.read_text(encoding="utf-8")
+        make = next(node for node in ast.parse(text).body if getattr(node, "name", "") == "make")
+        pictures = [
+            f"{name}.webp",
+            f"posters/{name}.webp",
+        ]  # a film, if there is one, and the poster
+        shown = [picture for picture in pictures if (ROOT / "docs" / picture).exists()]
         lines += [f"## {name}", "", tasks.summary(name), ""]
-        if (ROOT / "docs" / film).exists():
-            lines += [f"![{name}]({film})", ""]
-        code = ast.get_source_segment(text, make) or ""
-        lines += ["```sh", f"mjx-drax solve {name} --film", "```", "", "```python", code, "```", ""]
+        lines += [" ".join(f"![{name}]({picture}){{ width=400 }}" for picture in shown), ""]
+        lines += ["```sh", f"mjx-drax solve {name} --film", "```", ""]
+        lines += ["```python", ast.get_source_segment(text, make) or "", "```", ""]
     return "\n".join(lines)
 
 

@@ -174,7 +174,8 @@ def _beyond_limits(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> str 
         return None
     return (
         f"x_init of {name} lies outside of the range of joints ({'; '.join(found)}): move it "
-        "inside, or widen the range."
+        "inside, or widen the range. (Angles in the file are degrees, unless it says "
+        '<compiler angle="radian"/>.)'
     )
 
 
