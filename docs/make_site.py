@@ -74,8 +74,8 @@ def gallery() -> str:
     lines = [
         "# Gallery",
         "",
-        "All tasks of `mjx-drax list`. A picture shows the replay of an answer; the fainter a pose,",
-        "the earlier it is. Each task is one file that states a problem; the code is its function",
+        "All tasks of `mjx-drax list`. A picture shows the replay of an answer; of its poses the",
+        "fainter are earlier. Each task is one file that states a problem; the code is its function",
         "`make`. The command writes a video, a film, pictures and plots into `out/TASK`.",
         "",
     ]
