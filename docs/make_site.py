@@ -75,7 +75,7 @@ def gallery() -> str:
         "# Gallery",
         "",
         "All tasks of `mjx-drax list`. A picture shows the replay of an answer; of its poses the",
-        "fainter are earlier. Each task is one file that states a problem; the code is its function",
+        "fainter are earlier. Each task is a file that states a problem; the code is its function",
         "`make`. The command writes a video, a film, pictures and plots into `out/TASK`.",
         "",
     ]
