@@ -67,6 +67,7 @@ from mjx_drax.kernels.compilation import compiled, keep_programs
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
+from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish, Progress, begin_inside
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
@@ -385,7 +386,7 @@ class MPC:
         """Plan in one launch, and use it if it is finite."""
         cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
         number = self._traced.x_init.dtype.type
-        scale = replace(self._heated.scale, noise=number(np.sqrt(max(cost, 1e-12))))
+        scale = Scale(self._heated.scale.cost, number(np.sqrt(max(cost, 1e-12))))
         self._time = t  # of what is carried; the plan in use is older after one that failed
         problem, whole = self._at(t), np.append(np.asarray(x, number), self._further)
         if self._applied is not None:

@@ -83,9 +83,7 @@ class Scale:
     Attributes:
         cost: of mu, delta and rho, which all are costs.
         noise: of sigma, the square root of a cost: sigma^2 is a temperature.
-        states: how many units a state's box is wide, for a metric that measures states by it.
     """
 
     cost: ArrayLike = 1.0
     noise: ArrayLike = 1.0
-    states: ArrayLike = 6.0

@@ -404,7 +404,7 @@ class Search:
             return knots, key_noise
         keys = _keys_of(key, indices)
         guess = self.family.problem.guess
-        shared, own = self.family.question(self.settings.flow, Scale(), indices, 1)
+        shared, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
         return _drawn_by_row(own.problem, shared.problem, keys, self.chains, guess)
 
     def _settle(self, attempt: int, indices: np.ndarray, cost_scale: np.ndarray) -> None:
@@ -412,9 +412,8 @@ class Search:
         settings, cost = self.settings, cost_scale[indices]
         heated, flow = attempt > 0 and settings.heated, settings.flow
         noise = np.zeros(len(indices))
-        states = np.full(len(indices), settings.states[attempt % len(settings.states)])
         if settings.descent is None:
-            cost, noise, _ = (np.broadcast_to(s, len(indices)) for s in vars(flow.scale).values())
+            cost, noise = (np.broadcast_to(s, len(indices)) for s in vars(flow.scale).values())
         elif not heated:
             flow = replace(flow, iterations=settings.descent)
         else:
@@ -428,12 +427,12 @@ class Search:
             flow = replace(flow, iterations=0)
         if self.family.alone:
             if settings.descent is not None:
-                flow = replace(flow, scale=scale_of(cost[0], noise[0], states[0]))
+                flow = replace(flow, scale=scale_of(cost[0], noise[0]))
             self.flow = flow
         else:
-            self.flow = replace(flow, scale=scale_of(1.0, 1.0, 1.0))
+            self.flow = replace(flow, scale=scale_of(1.0, 1.0))
         self.question = self.family.question(
-            self.flow, Scale(cost, noise, states), indices, self.chains, self.polish
+            self.flow, Scale(cost, noise), indices, self.chains, self.polish
         )
         program = partial(iterate, tail=settings.after > 0)
         self.launch = spread(program, self.mesh, self.question[0])
@@ -622,7 +621,7 @@ class Search:
         checkpoint.require({**what, **known})
         problem, rows = family.problem, self.size * self.chains
         nx, nu, dtype = problem.dynamics.nx, problem.dynamics.nu, problem.x_init.dtype
-        ones = Scale(*np.ones((3, self.size)))
+        ones = Scale(np.ones(self.size), np.ones(self.size))
         none = np.zeros(self.size, int)
         shared, own = family.question(settings.flow, ones, none, self.chains, self.polish)
 

@@ -184,17 +184,17 @@ class Family:
 
         Args:
             flow: the settings of all.
-            scale: of each problem, arrays (len(indices),).
+            scale: cost and noise of each problem, (len(indices),).
             indices: of the problems.
             chains: of each problem.
             polish: what follows the noise, if anything but the flow's tail.
         """
         if self.alone:
             return partition(Question(flow, self.problem, polish=polish), None)
-        each = Scale(*(np.repeat(np.asarray(s), chains) for s in vars(scale).values()))
+        each = Scale(*(np.repeat(np.asarray(s), chains) for s in (scale.cost, scale.noise)))
         whole = Question(replace(flow, scale=each), self.rows(indices, chains), polish=polish)
         flags = jax.tree.map(lambda leaf: False, flow)
-        of_flow = jax.tree.leaves(replace(flags, scale=Scale(True, True, True)))
+        of_flow = jax.tree.leaves(replace(flags, scale=Scale(True, True)))
         of_polish = (False,) * len(jax.tree.leaves(polish))
         return partition(whole, (*of_flow, *self.differs, False, *of_polish))
 

@@ -93,9 +93,6 @@ class Restarts:
             finds better optima where all chains of the first attempt lead to the same ones.
         heated: whether attempts after the first are heated, or descend like the first. None: unless
             f has kinks.
-        states: how many units a state's box is wide, of each attempt in turn, where a Gauss-Newton
-            flow is polished (`scaled`). More units make dynamics stiffer and steps shorter, which
-            keeps plans from tunnelling through obstacles; fewer let them leave a poor basin.
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
@@ -118,7 +115,6 @@ class Restarts:
     within: float | None = None
     enough: float | None = None
     heated: bool | None = None
-    states: tuple[float, ...] = (12.0, 6.0, 6.0)
     rollouts: Rollouts | None = None
     polish: Polish | None = None
 
@@ -144,8 +140,7 @@ class Restarts:
         """The settings of the first attempt, for a scale of costs."""
         if self.descent is None:
             return self.flow
-        scale = scale_of(cost_scale, 0.0, self.states[0])
-        return replace(self.flow, iterations=self.descent, scale=scale)
+        return replace(self.flow, iterations=self.descent, scale=scale_of(cost_scale, 0.0))
 
     def for_problem(self, problem: Problem) -> Restarts:
         """The same settings, with a value for each that is None."""
@@ -192,10 +187,6 @@ class Restarts:
             require_not_negative("enough", self.enough)
         if not isinstance(self.heated, bool | None):
             raise DraxError(f"heated is {shown(self.heated)}: give True, False or None.")
-        if not isinstance(self.states, tuple | list) or not self.states:
-            raise DraxError(f"states is {shown(self.states)}: give numbers, such as (12.0, 6.0).")
-        for units in self.states:
-            require_positive("states", units, "positive numbers, such as (12.0, 6.0)")
         if not isinstance(self.polish, Polish | None):
             raise DraxError(f"polish is {shown(self.polish)}: give Polish() or None.")
         if self.polish is not None:
@@ -283,7 +274,7 @@ def _polished(
     return replace(settings, polish=replace(polish or usual, **given))
 
 
-def scale_of(cost: float, noise: float, states: float) -> Scale:
+def scale_of(cost: float, noise: float) -> Scale:
     """Scales as numbers of one type, so that other values do not recompile."""
     number = jnp.result_type(float).type
-    return Scale(number(cost), number(noise), number(states))
+    return Scale(number(cost), number(noise))

@@ -1,14 +1,15 @@
 """Gauss-Newton's step in coordinates without units, as the default flow takes it.
 
 The penalty mu |h|^2 and the damping delta |dz|^2 add up numbers of different units. So the flow
-measures each state in a sixth or a twelfth of the box that initial knots are drawn from (as
-`Restarts.states` says for the attempt), and each control in halves: x = S x', u = U u'. In these
-coordinates
+measures each state in parts of the box that initial knots are drawn from, sixths with noise and
+twelfths without, and each control in halves: x = S x', u = U u'. In these coordinates
 
     A' = S^-1 A S    B' = S^-1 B U    h' = S^-1 h    lambda' = S lambda    g' = S g    H' = S H S
 
 and then the step is turned back. The box says in which units the states are; millimetres and
-metres give the same step.
+metres give the same step. Smaller parts make the dynamics stiffer and steps shorter: a descent
+then does not tunnel through obstacles, from where no noise would bring it back. Under noise larger
+parts lead to better optima.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from mjx_drax.method.model import Derivatives, Linearization, Model, Multipliers
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 
-CONTROLS = 2.0
-"""How many units a control's box is wide."""
+DESCENT, HEATED, CONTROLS = 12.0, 6.0, 2.0
+"""In how many parts the box is measured: states without noise, with noise; controls."""
 
 
 @register_dataclass
@@ -91,7 +92,8 @@ def without_units(flow: Langevin, problem: Problem) -> Langevin:
     if not isinstance(metric, GaussNewton):
         return flow
     of_x, of_u = widths(problem)
-    x = jnp.where(of_x > 0.0, of_x / flow.scale.states, 1.0)
+    parts = jnp.where(jnp.asarray(flow.scale.noise) > 0.0, HEATED, DESCENT)
+    x = jnp.where(of_x > 0.0, of_x / parts, 1.0)
     u = jnp.where(of_u > 0.0, of_u / CONTROLS, 1.0)
     return replace(flow, preconditioner=Scaled(metric, x, u))
 

@@ -11,7 +11,9 @@ to its floor too. The scale of costs is that of answers, not of knots:
     scale = SHARE R + min(SHARE T, max(EFFORT E, SHARE R))
 
 R and T are medians of the running and of the terminal cost above their floors, and E is the median
-of what the running cost loses by a step d of controls alone. With a heavy terminal weight answers
+of what the running cost loses by a step d of controls alone, from controls as far from the middle
+of their box as its root mean square. (Initial controls will not do: about half of the chains have
+them close to the middle, so that their median is a toss-up.) With a heavy terminal weight answers
 cost what the way to the goal does, so beyond some weight T no longer counts. Where nothing is
 polished it counts in full: there the penalty alone holds the dynamics against the terminal cost.
 """
@@ -105,15 +107,25 @@ def _sizes(problem: Problem, knots: Trajectory, by: Any) -> Sizes:
         return now, jnp.fmin(now, moved)
 
     keys = jax.random.split(jax.random.key(0), problem.horizon)
-    running, least, effort = jax.vmap(stage)(*problem.stages(knots), keys)
+    x, u, at_knot = problem.stages(knots)
+    of_both = jax.vmap(lambda u: jax.vmap(stage)(x, u, at_knot, keys))
+    running, least, effort = of_both(jnp.stack([u, _wide(problem)]))
     terminal, least_end = jax.vmap(end)(knots.x, keys)
     return Sizes(
-        jnp.sum(running),
+        jnp.sum(running[0]),
         terminal[-1],
         problem.horizon * jnp.nanmin(least),
         jnp.nanmin(least_end),
-        jnp.sum(jnp.maximum(effort, 0.0)),
+        jnp.sum(jnp.maximum(effort[1], 0.0)),
     )
+
+
+def _wide(problem: Problem) -> Array:
+    """Controls (K, nu) as far from the middle of their box as its root mean square."""
+    box, shape = problem.scatter, (problem.horizon, problem.dynamics.nu)
+    side = jax.random.rademacher(jax.random.key(0), shape, problem.x_init.dtype)
+    u = 0.5 * (box.u_lower + box.u_upper) + side * (box.u_upper - box.u_lower) / np.sqrt(12.0)
+    return jnp.where(jnp.isfinite(u), u, 0.0)
 
 
 def _step(g: Array, H: Array, reach: Array) -> Array:
