@@ -251,7 +251,7 @@ def outcome_lines(
       solution: from `solve`.
       chain: the best one by default.
       plan: say what the plan breaks, not what came of its replay.
-      brief: of a certified chain's replay no more than its cost and the verdict.
+      brief: no more than the cost, the verdict, and what came of the replay or the plan breaks.
     """
     chain = solution.best_chain if chain is None else chain
     problem, mode, where = solution.problem, solution.mode_of(chain), None
@@ -273,16 +273,15 @@ def outcome_lines(
         told,
         "t = {time}",
     ]
-    certified = bool(solution.certified_chains[chain])
-    if brief and certified and not plan:
-        optimal = solution.status[chain] == "optimal"
-        verdict = "certified and optimal" if optimal else "certified"
-        told = told.partition(",")[0]  # without its distance from the plan
-        return [problem.name, "t = {time}", f"cost {cost:.3g}", verdict, f"{mode}: {told}"]
-    if not certified:
-        infeasible = "the plan is infeasible"
-        reason = "no replay succeeds" if solution.feasible[chain] else infeasible
-        lines.insert(1, f"{UNCERTIFIED}: {reason}")
+    verdict = "certified and optimal" if solution.optimal_chains[chain] else "certified"
+    if not solution.certified_chains[chain]:
+        reason = "no replay succeeds" if solution.feasible[chain] else "the plan is infeasible"
+        verdict = f"{UNCERTIFIED}: {reason}"
+        lines.insert(1, verdict)
+    if brief:
+        if not plan:
+            made, told = f"{mode}:", told.partition(",")[0]  # without its distance from the plan
+        return [problem.name, "t = {time}", f"cost {cost:.3g}", verdict, f"{made} {told}"]
     return lines
 
 

@@ -255,13 +255,14 @@ def test_overlay_says_what_is_certified(
         assert ("residual not known" if solution is cartpole else known) in lines
         assert "bound violation 0" in lines
         assert f"{lines[-3]} {lines[-2]}".startswith(f"{engine}, {mode}, ")
-        brief = video.outcome_lines(judged, brief=True)
+        name, time, cost, verdict, told = video.outcome_lines(judged, brief=True)
+        assert (name, time) == (lines[0], lines[-1])
+        assert cost == f"cost {judged.replay_cost[judged.best_chain]:.3g}"
+        assert told == mode
         if judged.certified:
-            cost = f"cost {judged.replay_cost[judged.best_chain]:.3g}"
-            verdict = "certified" if solution is cartpole else "certified and optimal"
-            assert brief == [lines[0], lines[-1], cost, verdict, mode]
+            assert verdict == ("certified" if solution is cartpole else "certified and optimal")
         else:
-            assert brief == lines
+            assert verdict == f"NOT CERTIFIED: {warning}"
         assert lines[-1] == "t = {time}"
 
 
@@ -290,6 +291,8 @@ def test_the_plan_of_any_chain_can_be_filmed(pendulum: Solution, tmp_path: Path)
     assert "breaks the dynamics in angle [rad]" in " ".join(lines)
     assert "at knot 2," in " ".join(lines)
     assert "keeps to the dynamics" in video.outcome_lines(failed, 0, plan=True)
+    told = video.outcome_lines(failed, 1, plan=True, brief=True)[-1]
+    assert told.startswith("PLAN of chain 1, not a replay: breaks the dynamics in angle [rad]")
     with pytest.raises(DraxError, match=f"chain is 99: give a number below {len(x)}"):
         video.render(failed, path, draw=draw, chain=99)
 
