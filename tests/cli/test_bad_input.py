@@ -69,7 +69,6 @@ COMMANDS = [
      "tolerance is 0.001", "leave tolerance out"),
     ("max-iterations", task("--max-iterations", "0"), "--max-iterations", "whole number"),
     ("precision", task("--precision", "16"), "--precision", "16", "32", "64"),
-    ("film-no-model", task("--film"), "draw="),
     ("film-suffix", lambda at: ["solve", "bug_trap", "--film", "a.avi", "--out", str(at.folder)],
      "a.avi", ".gif"),
     ("html-no-model", task("--html"), "no MuJoCo model"),

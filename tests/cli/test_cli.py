@@ -350,7 +350,7 @@ def test_export_writes_what_it_can(tmp_path, capsys):
     assert (folder / "replay.csv").exists()
 
 
-def test_errors_name_cause_and_fix(own, capsys):
+def test_errors_name_cause_and_fix(own, capsys, monkeypatch):
     model, cost = str(own / "slider.xml"), str(own / "mycost.py")
     assert "pendulum_swingup" in error_of(capsys, "solve", "pendulumm")
     assert "--cost" in error_of(capsys, "solve", "--model", model)
@@ -364,6 +364,7 @@ def test_errors_name_cause_and_fix(own, capsys):
     (own / "mycost.py").write_text("def terminal_cost(data):\n    return data.qpos[0]")
     assert "--horizon" in error_of(capsys, "solve", "--model", model, "--cost", cost)
     at = ["--out", str(own / "out")]
+    monkeypatch.delattr(tasks.load("pendulum"), "draw")
     assert "draw=" in error_of(capsys, "solve", "pendulum", "--film", *at)
     assert ".gif" in error_of(capsys, "solve", "bug_trap", "--film", "film.avi", *at)
     assert "speed" in error_of(capsys, "solve", "bug_trap", "--speed", "0", *at)
