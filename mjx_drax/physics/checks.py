@@ -274,13 +274,12 @@ def compare(
             return one_step.step(model, x, u)
 
         def slope(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
-            end = reached(model, x, u)
+            def change(dz: Array) -> tuple[Array, Array]:
+                end = reached(model, joints.integrate(x, dz[:ndx]), u + dz[ndx:])
+                return joints.difference(end, jax.lax.stop_gradient(end)), end
 
-            def change(dz: Array) -> Array:
-                moved = reached(model, joints.integrate(x, dz[:ndx]), u + dz[ndx:])
-                return joints.difference(moved, end)
-
-            return end, jax.jacfwd(change)(jnp.zeros(ndx + len(u)))
+            jacobian, end = jax.jacfwd(change, has_aux=True)(jnp.zeros(ndx + len(u)))
+            return end, jacobian
 
         one = slope if derivatives else reached
 

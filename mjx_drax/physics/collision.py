@@ -9,13 +9,15 @@
   points on them.
 - Two polytopes touch at every point once, where MJX repeats some, and hulls of meshes take less
   memory (`polytopes`).
-- Hulls of meshes have the normals of their faces; see `polytope`.
+- Hulls of meshes have the normals of their faces; see `polytope`. Pairs of hulls of similar sizes
+  are one computation, where MJX has one for each pair, which takes seconds each to compile.
 - Pairs of geoms can be left out, by `exclude_signature` of the MJX model.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import threading
 from collections.abc import Collection, Iterable, Iterator
@@ -60,6 +62,9 @@ constant in derivatives, which grow without bound; below the second they are the
 SAME = 1e-6
 """How close two contacts of one pair are the same one [m]."""
 
+GROWTH = 4
+"""Hulls whose numbers of corners are between the same powers of this are padded to one size."""
+
 POINTS = 66
 """Points on the hull that stands for an ellipsoid: six, and edges halved twice."""
 
@@ -90,6 +95,7 @@ def extended(left_out: Pairs = ()) -> Iterator[None]:
     """
     with _ONE_AT_A_TIME:
         table, pairs = dict(COLLISIONS), collision_driver.geom_pairs
+        groups = collision_driver._geom_groups
 
         def kept(model: Any) -> Iterator[tuple[int, int, int]]:
             out = {signature(*pair) for pair in left_out}
@@ -98,12 +104,60 @@ def extended(left_out: Pairs = ()) -> Iterator[None]:
 
         COLLISIONS.update(_OWN)
         collision_driver.geom_pairs = kept
+        collision_driver._geom_groups = lambda model: _merged(model, groups(model))
         try:
             yield
         finally:
             COLLISIONS.clear()
             COLLISIONS.update(table)
             collision_driver.geom_pairs = pairs
+            collision_driver._geom_groups = groups
+
+
+def _merged(model: Any, groups: dict[Any, list[Any]]) -> dict[Any, list[Any]]:
+    """MJX's groups of pairs, those of hulls of similar sizes in one.
+
+    Its `data_ids` then are sizes in place of meshes; -1 stands for a box.
+    """
+    if isinstance(model, mujoco.MjModel):  # whose contacts are counted only
+        return groups
+    merged: dict[Any, list[Any]] = {}
+    for key, pairs in groups.items():
+        if key.types in _HULLS:
+            sizes = tuple(_size(model._impl.mesh_convex[i]) if i >= 0 else -1 for i in key.data_ids)
+            key = dataclasses.replace(key, data_ids=sizes)
+        merged.setdefault(key, []).extend(pairs)
+    # Those of a <pair> come first, as MJX reads them
+    return {key: sorted(pairs, key=lambda pair: pair[2] < 0) for key, pairs in merged.items()}
+
+
+def _size(hull: ConvexMesh) -> int:
+    """The power of `GROWTH` that a hull's number of corners is below."""
+    return int(np.ceil(np.log(len(hull.vert)) / np.log(GROWTH)))
+
+
+def _alike(model: mjx.Model, size: int) -> tuple[ConvexMesh, np.ndarray]:
+    """All hulls of a size, padded and stacked, and the place of each mesh among them (nmesh,).
+
+    Corners, faces and edges are repeated; edges that are have no faces beside them, and so touch
+    nothing.
+    """
+    every = model._impl.mesh_convex
+    of_size = [i for i, hull in enumerate(every) if hull is not None and _size(hull) == size]
+    hulls = [jax.tree.map(jnp.asarray, every[i]) for i in of_size]
+    most = jax.tree.map(lambda *arrays: tuple(np.max([a.shape for a in arrays], axis=0)), *hulls)
+
+    def padded(hull: ConvexMesh) -> ConvexMesh:
+        def pad(array: Array, shape: tuple[int, ...], mode: str = "edge") -> Array:
+            missing = [(0, int(n) - m) for n, m in zip(shape, array.shape, strict=True)]
+            return jnp.pad(array, missing, mode)
+
+        beside = pad(hull.edge_face_normal, most.edge_face_normal, "constant")
+        return jax.tree.map(pad, hull, most).replace(edge_face_normal=beside)
+
+    place = np.zeros(len(every), int)
+    place[of_size] = np.arange(len(of_size))
+    return jax.tree.map(lambda *arrays: jnp.stack(arrays), *map(padded, hulls)), place
 
 
 def signature(a: int, b: int) -> int:
@@ -331,20 +385,22 @@ def with_corners(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Con
 
 
 def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
-    """The same of boxes with meshes, and of two meshes."""
+    """The same of boxes with meshes, and of two meshes; `key.data_ids` as in `_merged`."""
+    stacks = [None if size < 0 else _alike(model, size) for size in key.data_ids]
 
     def hull(place: int, g: Array) -> ConvexMesh:
-        if int(key.types[place]) == BOX:
+        stack = stacks[place]
+        if stack is None:
             return _hull(BOX, model.geom_size[g])
-        mesh: ConvexMesh = model._impl.mesh_convex[key.data_ids[place]]
-        return mesh
+        which = jnp.asarray(stack[1][model.geom_dataid])[g]
+        return jax.tree.map(lambda array: array[which], stack[0])
 
     def of_pair(pair: Array) -> Contacts:
         one, other = pair
         turn, origin = data.geom_xmat[other], data.geom_xpos[other]
         centre, axes = turn.T @ (data.geom_xpos[one] - origin), turn.T @ data.geom_xmat[one]
         placed = polytopes.moved(hull(0, one), centre, axes)
-        dist, pos, normal = polytopes.contacts(placed, hull(1, other))
+        dist, pos, normal = polytopes.contacts(placed, hull(1, other), len(geom))
         frame = jnp.repeat(make_frame(turn @ normal)[None], len(dist), axis=0)
         return dist, pos @ turn.T + origin, frame
 
@@ -378,6 +434,9 @@ def _function(collide: Any, contacts: int) -> Any:
     function.ncon = contacts  # type: ignore[attr-defined]
     return function
 
+
+_HULLS = {(BOX, MESH), (MESH, MESH)}
+"""Kinds of geoms that `between_hulls` collides."""
 
 _CYLINDERS, _ELLIPSOIDS = _function(with_corners, 4), _function(with_corners, 1)
 

@@ -39,15 +39,17 @@ APART = 1.0
 Contacts = tuple[Array, Array, Array]
 
 
-def contacts(one: ConvexMesh, other: ConvexMesh) -> Contacts:
+def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1) -> Contacts:
     """Four contacts: distances (4,), positions (4, 3), and their normal (3,) from one to other.
 
     Args:
         one, other: in the same frame.
+        alike: so many pairs of a state are computed at once, by `jax.vmap`.
     """
     one, other = jax.tree.map(jnp.asarray, (one, other))
     a, b = lax.stop_gradient((one, other))
-    gaps = jnp.concatenate([_gaps(a, b.vert), _gaps(b, a.vert)])
+    at_once = AT_ONCE // alike
+    gaps = jnp.concatenate([_gaps(a, b.vert, at_once), _gaps(b, a.vert, at_once)])
     best = jnp.argmax(gaps)
     of_one, count = best < len(a.face), len(a.face)
     axis = jnp.where(
@@ -96,13 +98,13 @@ def _padded(face: Array, most: int) -> Array:
     return jnp.pad(face, ((0, most - len(face)), (0, 0)), "edge")
 
 
-def _gaps(a: ConvexMesh, points: Array) -> Array:
+def _gaps(a: ConvexMesh, points: Array, at_once: int) -> Array:
     """How far the lowest of points (n, 3) is above each face of a polytope, (faces,)."""
 
     def above(normal: Array, corner: Array) -> Array:
         return jnp.min(jnp.matmul(points, normal, precision="highest")) - normal @ corner
 
-    block = max(1, AT_ONCE // len(points))
+    block = max(1, at_once // len(points))
     planes = a.face_normal, a.face[:, 0]
     if block >= len(a.face):
         return jax.vmap(above)(*planes)

@@ -85,8 +85,12 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if turned.any():
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
         model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
-    data = _at_velocities(model, _at_positions(model, data))
-    data = mjx.fwd_actuation(model, data)
+    return _driven(model, _at_positions(model, data))
+
+
+def _driven(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`_smooth` for `data` that has all that positions decide."""
+    data = mjx.fwd_actuation(model, _at_velocities(model, data))
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + data.qfrc_applied
     qacc = solve_positive(internal(data).M, force)
     return data.replace(qfrc_smooth=force, qacc_smooth=qacc)
