@@ -6,8 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax.physics._mjx import COLLISIONS
-from mjx_drax.physics.collision import CORNERS, collision, hulls, make_data, plane_box
+from mjx_drax.physics import polytopes
+from mjx_drax.physics._mjx import COLLISIONS, collision_driver, mjx
+from mjx_drax.physics.collision import (
+    CORNERS,
+    collision,
+    extended,
+    hulls,
+    make_data,
+    plane_box,
+)
 from mjx_drax.physics.mjx_model import put_model
 
 BOX = """
@@ -184,3 +192,41 @@ def test_capsules_at_any_angle_slide_as_in_the_c_engine():
         mujoco.mj_resetData(model, wanted)  # upright: any direction is as good, and finite
         assert np.isfinite(find(wanted).frame).all()
     assert steep > 5
+
+
+def test_hulls_of_other_sizes_are_one_computation_and_touch_as_each_alone():
+    rng, spec = np.random.default_rng(0), mujoco.MjSpec()
+    for i, count in enumerate((20, 40, 60)):
+        points = rng.normal(size=(count, 3))
+        points *= [0.1, 0.08, 0.05] / np.linalg.norm(points, axis=1, keepdims=True)
+        spec.add_mesh(name=f"m{i}", uservert=points.ravel())
+        body = spec.worldbody.add_body(pos=[0.12 * i, 0.05 * i, 0.0], quat=rng.normal(size=4))
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"m{i}")
+    model = spec.compile()
+    with jax.enable_x64(True):
+        on_device = put_model(model)
+        with extended():
+            groups = collision_driver._geom_groups(on_device)
+        data = mjx.kinematics(on_device, make_data(on_device))
+        contact = collision(on_device, data)._impl.contact
+        assert [len(pairs) for pairs in groups.values()] == [3]
+        meshes, active = hulls(model, range(3)), 0
+        for i, (a, b) in enumerate(np.asarray(contact.geom[::4])):
+            one, other = (
+                polytopes.moved(
+                    jax.tree.map(jnp.asarray, meshes[model.geom_dataid[g]]),
+                    data.geom_xpos[g],
+                    data.geom_xmat[g],
+                )
+                for g in (a, b)
+            )
+            dist, pos, normal = polytopes.contacts(one, other)
+            own, acts = slice(4 * i, 4 * i + 4), np.asarray(dist) < 0
+            kept = np.asarray(contact.dist[own]) < 0  # every point once
+            found = np.column_stack([contact.dist[own], contact.pos[own]])[kept]
+            alone = np.unique(np.column_stack([dist, pos])[acts].round(12), axis=0)
+            assert np.allclose(np.unique(found.round(12), axis=0), alone, atol=1e-11)
+            assert np.allclose(contact.frame[own, 0], normal, atol=1e-12)
+            active += len(alone)
+    assert active > 0
