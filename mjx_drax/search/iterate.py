@@ -223,7 +223,7 @@ def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     return jax.vmap(lambda z: diagnosed(problem, z, problem.values(z)))(trajectory)
 
 
-@jax.jit
+@compiled
 @full_precision
 def feedback_gains(own: Question, shared: Question, states: State) -> Array:
     """Time-varying LQR gains (rows, K, nu, ndx) for a flow whose metric brings none."""

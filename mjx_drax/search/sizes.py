@@ -30,6 +30,7 @@ from jax import Array
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels import linalg
+from mjx_drax.kernels.compilation import compiled
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
@@ -66,7 +67,7 @@ class Sizes:
     effort: Array
 
 
-@jax.jit
+@compiled
 @linalg.full_precision
 def sizes_of(own: Question, shared: Question, knots: Trajectory) -> Sizes:
     """The sizes of every chain, (rows,), at knots (rows, K, ...)."""

@@ -31,6 +31,7 @@ from jax import Array
 
 from mjx_drax.base.errors import DraxError, require_not_negative, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.kernels.compilation import compiled
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
@@ -314,7 +315,7 @@ def measured(
     )
 
 
-@jax.jit
+@compiled
 @full_precision
 def _measured(
     own: Problem,
