@@ -66,9 +66,12 @@ def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1) -> Contacts:
         *(jnp.where(of_one, *pair) for pair in (faces, faces[::-1], normals, normals[::-1])), -axis
     )
 
-    for _ in range(ROUNDS):
-        p, q, gap = _edges(a, b, direction)
-        direction = jnp.where(jnp.isfinite(gap), _normal(a, b, p, q), direction)
+    def round_(_: int, found: tuple[Array, ...]) -> tuple[Array, ...]:
+        p, q, gap = _edges(a, b, found[0])
+        return jnp.where(jnp.isfinite(gap), _normal(a, b, p, q), found[0]), p, q, gap
+
+    none = jnp.zeros((), jnp.int32)
+    _, p, q, gap = lax.fori_loop(0, ROUNDS, round_, (direction, none, none, gaps[0]))
     across, least = _normal(one, other, p, q), jnp.max(lax.stop_gradient(dist))
     beside = lax.stop_gradient(across @ axis) < ASIDE
     nearer = jnp.where(least < 0, gap > least - SAME, (gap < 0) & jnp.isfinite(gap))

@@ -84,12 +84,15 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     turned = np.isin(model.jnt_type, (FREE, BALL))
     if turned.any():
         data = data.replace(qfrc_applied=_springs(model, turned, data.qpos))
-        model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
     return _driven(model, _at_positions(model, data))
 
 
 def _driven(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`_smooth` for `data` that has all that positions decide."""
+    """`_smooth` for `data` that has all that positions alone decide."""
+    data = mjx.make_constraint(model, data)
+    turned = np.isin(model.jnt_type, (FREE, BALL))
+    if turned.any():  # their springs have pulled
+        model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
     data = mjx.fwd_actuation(model, _at_velocities(model, data))
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + data.qfrc_applied
     qacc = solve_positive(internal(data).M, force)
@@ -103,7 +106,7 @@ def _at_positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = collision(model, mjx.tendon_armature(model, data))
     if model.ntendon:
         data = with_internal(data, M=jnp.where(_in_inertia(model), internal(data).M, 0.0))
-    return mjx.transmission(model, mjx.make_constraint(model, data))
+    return mjx.transmission(model, data)
 
 
 def _at_velocities(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -257,13 +260,16 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     """
     start = kinematics(model, data_at(model, x, u))
     data = _smooth(model, start)
-    solution = _solution(model, data)
+    placed, solution = data, _solution(model, data)
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
     @pruned
     def sides(changed: dict[str, Array]) -> Array:
-        at = _smooth(model, start.replace(**changed))
+        if by_q.keys() <= changed.keys():
+            at = _smooth(model, start.replace(**changed))
+        else:  # nothing has moved
+            at = _driven(model, placed.replace(**changed))
         forces = ConstraintForces.create(model, at.replace(qacc=a), grad=False)
         pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + forces.qfrc_constraint
         left, later = _tendon_bias(model, at, a) - pushed, data.qvel[:0]
@@ -276,13 +282,15 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
         at = {name: getattr(start, name) for name in directions}
 
         def of_one(direction: dict[str, Array]) -> Array:
-            return jax.jvp(lambda part: sides(whole | part), (at,), (direction,))[1]
+            rest = whole if by_q.keys() <= at.keys() else driven
+            return jax.jvp(lambda part: sides(rest | part), (at,), (direction,))[1]
 
         return jax.vmap(of_one, out_axes=1)(directions)
 
     by_q = frame_derivatives(model, data)
     sizes = {"qvel": model.nv, "act": model.na, "ctrl": model.nu}
-    whole = {name: getattr(start, name) for name in (*by_q, *sizes)}
+    driven = {name: getattr(start, name) for name in sizes}
+    whole = driven | {name: getattr(start, name) for name in by_q}
     columns = [derivatives(by_q)]
     columns += [
         derivatives({name: jnp.eye(size, dtype=a.dtype)}) for name, size in sizes.items() if size
