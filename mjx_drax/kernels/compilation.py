@@ -46,7 +46,9 @@ def run_once(function: Callable[..., Any], *arguments: Any) -> Any:
 
 @lru_cache
 def _options() -> dict[str, str | bool] | None:
-    """Options for the present backend, if its compiler knows them."""
+    """Options for the present backend, if its compiler knows them and JAX is not told to hurry."""
+    if jax.config.values["jax_disable_most_optimizations"]:
+        return None
     options = OPTIONS.get(jax.default_backend())
     try:
         jax.jit(lambda x: x + 1, compiler_options=options)(0)

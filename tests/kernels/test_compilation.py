@@ -14,8 +14,11 @@ from mjx_drax.kernels.compilation import compiled
 
 @pytest.fixture(autouse=True)
 def _asked_anew():
+    hurry = jax.config.values["jax_disable_most_optimizations"]
+    jax.config.update("jax_disable_most_optimizations", False)
     compilation._options.cache_clear()
     yield
+    jax.config.update("jax_disable_most_optimizations", hurry)
     compilation._options.cache_clear()
 
 
@@ -35,6 +38,11 @@ def test_the_compiler_gets_options_that_it_knows(monkeypatch, backend):
     assert program(3.0, times=2) == 12.0
     settings = {"compiler_options": options, "static_argnames": "times"}
     assert given == [settings]
+
+
+def test_there_are_no_options_where_jax_is_told_to_hurry():
+    jax.config.update("jax_disable_most_optimizations", True)
+    assert compilation._options() is None
 
 
 def test_an_option_that_the_compiler_does_not_know_is_left_out(monkeypatch):
