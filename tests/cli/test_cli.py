@@ -188,6 +188,7 @@ def test_the_plan_is_filmed_too_if_nothing_is_certified(slider, tmp_path, monkey
     assert set(names) < set(pictures.NAMES)
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):
     def interrupt(self, done, total, info):
         raise KeyboardInterrupt

@@ -151,6 +151,7 @@ def test_where_nothing_is_smooth_derivatives_are_finite_and_lead_out(name):
         assert value(p + 1e-2 * g) > value(p) + 1e-3
 
 
+@pytest.mark.slow
 def test_grids_are_exact_at_their_values_and_smooth_between():
     rng = np.random.default_rng(2)
     for name in ("grid", "grid in space"):

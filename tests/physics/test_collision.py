@@ -194,6 +194,7 @@ def test_capsules_at_any_angle_slide_as_in_the_c_engine():
     assert steep > 5
 
 
+@pytest.mark.slow
 def test_hulls_of_other_sizes_are_one_computation_and_touch_as_each_alone():
     rng, spec = np.random.default_rng(0), mujoco.MjSpec()
     for i, count in enumerate((20, 40, 60)):

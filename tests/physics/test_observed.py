@@ -76,6 +76,7 @@ def test_elements_have_what_the_c_engine_has_in_the_same_shapes():
         np.testing.assert_allclose(value, wanted[key], rtol=1e-3, atol=2e-3, err_msg=str(key))
 
 
+@pytest.mark.slow
 def test_one_function_is_cost_and_goal_and_its_derivative_is_that_of_the_array():
     def height(data, *_):
         return data.site("tip").xpos[2:]

@@ -72,12 +72,8 @@ MODELS = {
 }
 
 
-SLOW = {"everything", "chain", "acrobot", "cartpole"}  # to compile
-
-
-@pytest.mark.parametrize(
-    "model", [pytest.param(m, marks=pytest.mark.slow) if m in SLOW else m for m in MODELS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
 def test_steps_and_jacobians_are_those_of_mjx(model, monkeypatch):
     with jax.enable_x64(True):
         dynamics = task(MODELS[model]).dynamics

@@ -124,13 +124,8 @@ STATES = {
 }
 
 
-@pytest.mark.parametrize(
-    "xml",
-    [
-        pytest.param(xml, id=name, marks=[pytest.mark.slow] if name == "linked" else [])
-        for xml, name in zip(STATES, ("floating", "linked"), strict=True)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("xml", STATES, ids=("floating", "linked"))
 def test_a_step_and_its_jacobian_are_the_c_engines(xml):
     assert_steps_like_the_c_engine(mujoco.MjModel.from_xml_string(xml), STATES[xml])
 

@@ -62,6 +62,7 @@ def _double():
         yield
 
 
+@pytest.mark.slow
 def test_the_exact_hessian_is_that_of_the_whole_lagrangian():
     problem = posed(
         lambda x, u: jnp.array([x[0] * jnp.exp(u[0]), jnp.sin(x[0] * x[1]) + u[0] ** 3])

@@ -52,6 +52,7 @@ def fastest(**changes):
     return from_function(**given | changes)
 
 
+@pytest.mark.slow
 def test_the_least_time_of_a_double_integrator(tmp_path):
     problem = fastest()
     found = solve(problem, chains=4)

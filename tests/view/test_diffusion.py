@@ -93,6 +93,7 @@ def test_what_cannot_be_recorded() -> None:
 
 
 @pytest.mark.parametrize("painted", [False, True])
+@pytest.mark.slow
 def test_film_of_a_model(
     cartpole: Solution, painted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
