@@ -38,6 +38,9 @@ STEP = "the dynamics f(x, u)"
 CLOSE = 0.03
 """Least factor on the scatter of initial knots of chains that start nearer to x_init."""
 
+PARTS = 12.0
+"""In how many parts the box of initial knots is measured: no unit of the user's matters."""
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -245,15 +248,36 @@ class Problem:
         )
 
     def max_defect(self, trajectory: Trajectory) -> Array:
-        """max|h| over dynamics and constraints (inequalities count where positive), scalar."""
+        """max|h| over dynamics and constraints, scalar: see `worst`."""
         return self.worst(self.values(trajectory))
 
     def worst(self, values: Values) -> Array:
-        """max|h| of values that are known, scalar."""
-        defect = jnp.abs(values.defects).max(initial=0.0)
+        """max|h| of values that are known, scalar.
+
+        Defects of the dynamics are measured in `unit`, constraints as the user has them;
+        inequalities count where positive.
+        """
+        defect = jnp.abs(values.defects / self.unit).max(initial=0.0)
         stage = self.constraint.violation(values.constraints.stage)
         end = self.terminal_constraint.violation(values.constraints.terminal)
         return jnp.maximum(defect, jnp.maximum(stage, end))
+
+    @property
+    def widths(self) -> tuple[Array, Array]:
+        """Widths of the box of initial knots, (ndx,) and (nu,); 0 where they are infinite."""
+        box, tangent = self.scatter, self.dynamics.tangent
+
+        def of(ends: Array) -> Array:
+            finite = jnp.where(jnp.isfinite(ends), jnp.abs(ends), 0.0)
+            return finite if finite.ndim == 1 else finite.max(axis=0)
+
+        return of(tangent(box.x_upper - box.x_lower)), of(box.u_upper - box.u_lower)
+
+    @property
+    def unit(self) -> Array:
+        """What states are measured in, (ndx,): a twelfth of their box; 1 where it has no width."""
+        width = self.widths[0]
+        return jnp.where(width > 0.0, width / PARTS, 1.0)
 
     def no_change(self, trajectory: Trajectory) -> Trajectory:
         """The displacement of nothing: zeros in tangent space, (K, ndx) and (K, nu)."""

@@ -31,7 +31,7 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.scaled import without_units
 
 FEASIBLE = 1e-3
-"""Largest max|h| that counts as feasible."""
+"""Largest max|h| that counts as feasible: of defects in `Problem.unit`, and of constraints."""
 
 Tree = TypeVar("Tree")
 

@@ -28,8 +28,8 @@ from mjx_drax.method.model import Derivatives, Linearization, Model, Multipliers
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 
-DESCENT, HEATED, CONTROLS = 12.0, 6.0, 2.0
-"""In how many parts the box is measured: states without noise, with noise; controls."""
+HEATED, CONTROLS = 6.0, 2.0
+"""In how many parts the box is measured: states under noise, controls."""
 
 
 @register_dataclass
@@ -91,19 +91,7 @@ def without_units(flow: Langevin, problem: Problem) -> Langevin:
     metric = flow.preconditioner
     if not isinstance(metric, GaussNewton):
         return flow
-    of_x, of_u = widths(problem)
-    parts = jnp.where(jnp.asarray(flow.scale.noise) > 0.0, HEATED, DESCENT)
-    x = jnp.where(of_x > 0.0, of_x / parts, 1.0)
+    of_x, of_u = problem.widths
+    x = jnp.where((jnp.asarray(flow.scale.noise) > 0.0) & (of_x > 0.0), of_x / HEATED, problem.unit)
     u = jnp.where(of_u > 0.0, of_u / CONTROLS, 1.0)
     return replace(flow, preconditioner=Scaled(metric, x, u))
-
-
-def widths(problem: Problem) -> tuple[Array, Array]:
-    """The widths of the box of initial knots, (ndx,) and (nu,); 0 where they are infinite."""
-    box, tangent = problem.scatter, problem.dynamics.tangent
-
-    def of(ends: Array) -> Array:
-        finite = jnp.where(jnp.isfinite(ends), jnp.abs(ends), 0.0)
-        return finite if finite.ndim == 1 else finite.max(axis=0)
-
-    return of(tangent(box.x_upper - box.x_lower)), of(box.u_upper - box.u_lower)

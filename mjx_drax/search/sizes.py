@@ -36,7 +36,6 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.search.iterate import Question, by_row, partition
-from mjx_drax.search.scaled import widths
 
 SHARE = 1 / 300
 """The scale of costs, as a share of the median cost of the initial knots."""
@@ -83,7 +82,7 @@ def _sizes(problem: Problem, knots: Trajectory, by: Any) -> Sizes:
     """The sizes of one chain."""
     dynamics = problem.dynamics
     ndx, by, last = dynamics.ndx, dynamics.differentiator(by), problem.end
-    reach_x, reach_u = (REACH * of for of in widths(problem))
+    reach_x, reach_u = (REACH * of for of in problem.widths)
     reach = jnp.concatenate([reach_x, reach_u])
 
     def stage(x: Array, u: Array, knot: Knot, key: Array) -> tuple[Array, Array, Array]:

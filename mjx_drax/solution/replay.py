@@ -205,9 +205,10 @@ def plan_violations(family: Family, plan: np.ndarray, u: np.ndarray) -> Violatio
 
 def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violation:
     """Where one plan breaks the dynamics most; see `defects`."""
-    off = defects(problem, plan, u)
-    knot, entry = np.unravel_index(int(off.argmax()), off.shape)
-    return Violation(DYNAMICS, float(off[knot, entry]), FEASIBLE, int(entry), int(knot))
+    off, allowed = defects(problem, plan, u), FEASIBLE * np.asarray(problem.unit)
+    knot, entry = np.unravel_index(int((off / allowed).argmax()), off.shape)
+    tolerated = float(allowed[entry])
+    return Violation(DYNAMICS, float(off[knot, entry]), tolerated, int(entry), int(knot))
 
 
 def defects(problem: Problem, plan: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -96,7 +96,8 @@ class Results:
         trajectories: knots, (chains, K, nx) and (chains, K, nu), and slacks of inequalities.
         multipliers: lambda, of dynamics (chains, K, ndx) and constraints, and those of bounds.
         gains: feedback K_k, (chains, K, nu, ndx).
-        cost, max_defect, max_violation: of every chain's plan, (chains,).
+        cost, max_defect, max_violation: of every chain's plan, (chains,); `Problem.worst` says
+            what max_defect is measured in.
         residual: of the optimality conditions of every chain's plan, scaled: the largest of the
             Lagrangian's slope, defects, constraints and complementarity; NaN if not known,
             (chains,).
@@ -253,14 +254,15 @@ class Results:
         """
         if self.feasible[chain]:
             return None
-        found = [v for v in self.plan.of(chain) if "equality" in v.kind]
+        broken = (v for v in self.plan.of(chain) if "equality" in v.kind)
+        found = [v._replace(allowed=FEASIBLE) for v in broken]
         plan, u = self.plans[chain].astype(float), np.asarray(self.trajectories.u[chain])
         try:
             found.append(largest_defect(self.problem, plan, u))
         except DraxError:  # f is not there
             defect = float(np.nan_to_num(self.max_defect[chain], nan=np.inf))
             found.insert(0, Violation(DYNAMICS, defect, FEASIBLE, -1, -1))
-        return max(found, key=lambda v: v.size)
+        return max(found, key=lambda v: v.ratio)
 
     @property
     def best(self) -> Trajectory:

@@ -26,14 +26,16 @@ HEADERS = f"{'what':19}  {'entry':24}  knot  time [s]     size  tolerated"
 def of_plan(solution: Results, chain: int) -> list[Violation]:
     """Violations of a chain's plan, those of the dynamics included, the worst first.
 
-    Dynamics and constraints are tolerated up to what makes a plan feasible, 1e-3.
+    Dynamics and constraints are tolerated up to what makes a plan feasible: 1e-3 of the problem's
+    `unit` of a state, and 1e-3 of a constraint.
 
     Raises:
         DraxError: the solution was loaded without its problem.
     """
     problem, plan, u, extent = _motion(solution, chain)
     off = defects(problem, plan, u)
-    found = list(worst_knots(DYNAMICS, off, np.full(off.shape, FEASIBLE), 0))
+    allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.unit), off.shape)
+    found = list(worst_knots(DYNAMICS, off, allowed, 0))
     none = np.zeros(problem.dynamics.ndx)
     for violation in by_entry(problem, (plan, u), none, extent, Tolerances()):
         if "equality" in violation.kind:

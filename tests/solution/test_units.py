@@ -223,8 +223,7 @@ def test_the_same_motion_comes_out(name, change):
     knots, cost, share = answer(name)
     other, other_cost, other_share = answer(name, **SAME[change])
     assert other_cost == pytest.approx(cost, rel=2e-3)
-    # max|h| < 1e-3 is stricter in mm, and fewer chains end near the best
-    assert other_share >= share - (0.65 if change == "mm" else 0.35)
+    assert other_share >= share - 0.35
     x, u = np.asarray(other.x), np.asarray(other.u)
     apart = []
     for mine in ((np.asarray(knots.x), np.asarray(knots.u)), mirrored(name, knots)):

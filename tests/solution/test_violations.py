@@ -238,7 +238,7 @@ def test_an_infeasible_plan_says_where_it_breaks_the_dynamics(tmp_path):
     assert (where.kind, where.entry, where.knot) == ("dynamics", 1, 6)
     assert where.size == pytest.approx(0.5)
     assert where.told(made.problem) == (
-        "breaks the dynamics in x1 by 5.0e-01 (tolerated: 1.0e-03) at knot 6, 0.6 s"
+        "breaks the dynamics in x1 by 5.0e-01 (tolerated: 1.7e-04) at knot 6, 0.6 s"
     )
     assert made.where(1) is None
     assert made.status == ["infeasible", "feasible"]
