@@ -56,8 +56,8 @@ REPORT_EVERY = 20
 """Iterations between two reports, records of the history, and chances to interrupt; a hundredth
 of an attempt's where that is more."""
 
-STRICTER = 10.0
-"""Factor on the scale of costs after an attempt in which not one chain became feasible."""
+STRICTER, MOST = 10.0, 0.5
+"""Factor on the scale of costs after an attempt; the share of feasible chains that prevents it."""
 
 NEGLIGIBLE = 1e-3
 """Differences of cost below so many scales of costs do not count."""
@@ -352,8 +352,8 @@ class Search:
         if stage.attempt + 1 == settings.attempts or not len(todo):
             return False
         scale = stage.cost_scale.copy()
-        infeasible = ~kept.feasible.reshape(shape).any(axis=1)
-        scale[infeasible] *= STRICTER  # the knots' cost says too little: penalize defects more
+        feasible = kept.feasible.reshape(shape).mean(axis=1)
+        scale[feasible < MOST] *= STRICTER  # the knots' cost says too little: penalize defects more
         self.stage = replace(stage, attempt=stage.attempt + 1, cost_scale=scale, todo=todo, place=0)
         return True
 

@@ -11,7 +11,7 @@ Schedules are multiples of scales that are measured, so no setting depends on th
 
     cost     a share of the median cost of the initial knots, of which a heavy terminal weight does
              not count in full (`sizes`), for mu, delta and rho; ten times as much after an attempt
-             in which not one chain became feasible
+             that leaves more than half of the chains infeasible
     noise    the square root of the best cost so far, for sigma
 
 Costs are measured from their floor (`sizes`), so constants that are added to them change nothing.
@@ -43,7 +43,7 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.checks import check_flow
 
-ENOUGH, ENOUGH_KINKED = 0.95, 0.1
+ENOUGH, ENOUGH_KINKED = 0.95, 0.6
 """Default share of chains to be done; attempts are long where f has kinks."""
 
 WITHIN, WITHIN_KINKED = 0.1, 1.0
@@ -88,7 +88,7 @@ class Restarts:
         attempts: largest number of attempts, the first included.
         within: a chain is done if it is feasible and its cost exceeds the best chain's by at most
             this share. None: 0.1, and 1 where f has kinks.
-        enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.1
+        enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.6
             where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
             finds better optima where all chains of the first attempt lead to the same ones.
         heated: whether attempts after the first are heated, or descend like the first. None: unless
