@@ -13,6 +13,7 @@ from typing import Any
 
 from mjx_drax import tasks
 from mjx_drax.base.errors import require_not_negative
+from mjx_drax.base.files import write_json
 from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
 
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
@@ -87,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
 
     trials.run(options.runs, options.pushes, options.push, options.seed, report, **errors)
     numbers = {**trials.summary(), "push": options.push, "hold": options.hold, **errors}
-    written = [runs.save(numbers, folder).name]
+    written = [write_json(folder / "mpc.json", numbers).name]
     if options.video:
         written.append(runs.film(problem, trials.motions[0], folder / "mpc.mp4").name)
     for line in runs.lines(numbers):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole
-from mjx_drax.base.files import complete
 from mjx_drax.control.background import Background
 from mjx_drax.control.mpc import MPC, Statistics
 from mjx_drax.control.open_quantities import driven
@@ -234,13 +232,6 @@ def lines(numbers: dict[str, Any]) -> list[str]:
         f"cost      {numbers['cost']:.4g} a run of {numbers['duration']:g} s, on average",
         f"runs      {outcome}; {count} pushes in all",
     ]
-
-
-def save(numbers: dict[str, Any], folder: Path) -> Path:
-    """Write `mpc.json`; returns its path."""
-    with complete(folder / "mpc.json") as partial:
-        partial.write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
-    return folder / "mpc.json"
 
 
 def film(problem: Problem, motion: Motion, path: str | os.PathLike[str], **look: Any) -> Path:

@@ -8,6 +8,7 @@ can wait for each other forever in jaxlib's thread pool (0.10, on two cores, nea
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from operator import truediv
 from typing import Any
@@ -86,28 +87,27 @@ def _upper_by_rows(factor: Array, b: Array) -> Array:
     return jax.lax.fori_loop(0, len(b), row, jnp.zeros_like(b))
 
 
-def solve_lower(factor: Array, b: Array) -> Array:
-    """L^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
+def _solved(
+    factor: Array, b: Array, by_rows: Callable[..., Any], entries: Callable[..., Any], trans: int
+) -> Array:
+    """L^{-1} b, or L'^{-1} b if `trans`: of entries, by rows on CPUs, or by the library."""
     n = factor.shape[-1]
     if n == 0:
         return b
     if n > UNROLLED_UP_TO:
-        library = partial(solve_triangular, lower=True)
-        return jax.lax.platform_dependent(factor, b, cpu=_lower_by_rows, default=library)
-    rows, entries = _lower_rows(factor), [b[i] for i in range(n)]
-    return jnp.stack(small_matrices.solve_lower(rows, entries, _times_inverse))
+        library = partial(solve_triangular, lower=True, trans=trans)
+        return jax.lax.platform_dependent(factor, b, cpu=by_rows, default=library)
+    return jnp.stack(entries(_lower_rows(factor), [b[i] for i in range(n)], _times_inverse))
+
+
+def solve_lower(factor: Array, b: Array) -> Array:
+    """L^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
+    return _solved(factor, b, _lower_by_rows, small_matrices.solve_lower, 0)
 
 
 def solve_upper(factor: Array, b: Array) -> Array:
     """L'^{-1} b for lower triangular L (n, n) and b (n,) or (n, m)."""
-    n = factor.shape[-1]
-    if n == 0:
-        return b
-    if n > UNROLLED_UP_TO:
-        library = partial(solve_triangular, lower=True, trans=1)
-        return jax.lax.platform_dependent(factor, b, cpu=_upper_by_rows, default=library)
-    rows, entries = _lower_rows(factor), [b[i] for i in range(n)]
-    return jnp.stack(small_matrices.solve_upper(rows, entries, _times_inverse))
+    return _solved(factor, b, _upper_by_rows, small_matrices.solve_upper, 1)
 
 
 def solve(factor: Array, b: Array) -> Array:

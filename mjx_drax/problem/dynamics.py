@@ -169,11 +169,6 @@ class Dynamics:
             return np.asarray(x + dx)
         return rollout.apply(self, "integrate", x, dx)
 
-    def deviation(self, states: np.ndarray, plan: np.ndarray) -> np.ndarray:
-        """max|x - plan| in tangent space, (...,) for states and plan of shape (..., nx)."""
-        off = self.host_difference(states, np.broadcast_to(plan, states.shape))
-        return np.abs(off).max(axis=-1)
-
     def observe_replayed(self, x: np.ndarray, time: float) -> Any:
         """What goal functions receive for a replayed state (nx,) at a time [s]: here the state."""
         return x

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
@@ -44,6 +45,11 @@ class Extras(NamedTuple):
     v: Any
 
 
+def _of_inner(name: str) -> Any:
+    """What the inner system has under this name: a number, or a method."""
+    return property(attrgetter(f"inner.{name}"))
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Extended(Dynamics):
@@ -71,6 +77,12 @@ class Extended(Dynamics):
     order: int = field(metadata=Static)
     knot: Knot | None = None
 
+    given_nx, nu, dt, engine = map(_of_inner, ("nx", "nu", "dt", "engine"))
+    kinked, twice, checked = map(_of_inner, ("kinked", "twice", "checked"))
+    state_damping, fingerprint = map(_of_inner, ("state_damping", "fingerprint"))
+    differentiator = _of_inner("differentiator")
+    step_differentiator = _of_inner("step_differentiator")
+
     @property
     def sizes(self) -> Extras:
         """How many numbers each kind of the further states has."""
@@ -86,41 +98,6 @@ class Extended(Dynamics):
     def ndx(self) -> int:
         """Numbers in a difference of x'."""
         return self.inner.ndx + sum(self.sizes)
-
-    @property
-    def given_nx(self) -> int:
-        """Numbers in x."""
-        return self.inner.nx
-
-    @property
-    def nu(self) -> int:  # type: ignore[override]
-        """Numbers in a control."""
-        return self.inner.nu
-
-    @property
-    def dt(self) -> float:  # type: ignore[override]
-        """Time between knots [s]; where it is free, that of x_init."""
-        return self.inner.dt
-
-    @property
-    def kinked(self) -> bool:  # type: ignore[override]
-        """Whether the inner f has kinks."""
-        return self.inner.kinked
-
-    @property
-    def state_damping(self) -> float:  # type: ignore[override]
-        """That of the inner system."""
-        return self.inner.state_damping
-
-    @property
-    def twice(self) -> bool:  # type: ignore[override]
-        """That of the inner system."""
-        return self.inner.twice
-
-    @property
-    def checked(self) -> bool:  # type: ignore[override]
-        """That of the inner system."""
-        return self.inner.checked
 
     def extras(self, x: Any) -> Extras:
         """The further states of x' (..., nx), or those of a tangent vector (..., ndx)."""
@@ -210,26 +187,9 @@ class Extended(Dynamics):
         here = self.here(x, u)
         return Seen(self.inner.at(here).observe(self.inner_state(x), u), here)
 
-    def differentiator(self, by: Any) -> Any:
-        """As the inner system asks for."""
-        return self.inner.differentiator(by)
-
-    def step_differentiator(self, by: Any) -> Any:
-        """As the inner system asks for."""
-        return self.inner.step_differentiator(by)
-
     def in_float64(self) -> Extended:
         """The same system, for float64."""
         return replace(self, inner=self.inner.in_float64())
-
-    @property
-    def engine(self) -> str:
-        """What replays a result."""
-        return self.inner.engine
-
-    def fingerprint(self) -> bytes:
-        """That of the inner system."""
-        return self.inner.fingerprint()
 
     def replay(
         self,

@@ -46,7 +46,7 @@ from mjx_drax.search.restarts import Restarts
 from mjx_drax.search.settings import from_data
 from mjx_drax.solution.replay import Replays
 from mjx_drax.solution.results import Results
-from mjx_drax.solution.save import ARRAYS, FORMAT, SUMMARY, json_digest
+from mjx_drax.solution.save import ARRAYS, CHAIN, FORMAT, SUMMARY, json_digest
 from mjx_drax.solution.violations import KINDS, Tolerances, Violations
 
 Arrays = dict[str, np.ndarray]
@@ -61,7 +61,9 @@ def load(
     summary, arrays = _read(path)
     try:
         if problem is None:
-            problem = _stand_in(summary, arrays)
+            double = arrays["problem.x_init"].dtype == np.float64
+            with jax.enable_x64(True) if double else nullcontext():
+                problem = _stand_in(summary, arrays)
         else:
             _require_same(problem, summary, arrays)
             problem = _as_solved(problem, arrays)
@@ -143,14 +145,9 @@ def _solution(
         trajectories=_trajectory("solution.trajectories", arrays),
         multipliers=multipliers,
         gains=arrays["solution.gains"],
-        cost=arrays["chain_cost"],
-        max_defect=arrays["chain_max_defect"],
-        max_violation=arrays["chain_max_violation"],
-        residual=arrays["chain_residual"],
+        **{name: arrays[f"chain_{name}"] for name in CHAIN},  # type: ignore[arg-type]
         stalled=arrays.get("chain_stalled", np.zeros(len(arrays["chain_residual"]), bool)),
         tolerance=summary["tolerance"],
-        feasible_since=arrays["chain_feasible_since"],
-        died_at=arrays["chain_died_at"],
         interrupted=summary["interrupted"],
         plan=Violations(**_within("solution.plan.", arrays)),
         open_loop=_replays("solution.open_loop.", arrays),
@@ -179,8 +176,7 @@ def _require_consistent(solution: Results, summary: dict[str, Any]) -> None:
         "gains": (solution.gains, (chains, K, nu, dynamics.ndx)),
         "multipliers": (solution.multipliers.dynamics, (chains, K, dynamics.ndx)),
     }
-    numbers = ("cost", "max_defect", "max_violation", "residual", "feasible_since", "died_at")
-    for name in (*numbers, "stalled"):
+    for name in (*CHAIN, "stalled"):
         shapes[name] = getattr(solution, name), (chains,)
     for mode, violations in (
         ("plan", solution.plan),
@@ -271,12 +267,6 @@ class _Manifold(FunctionDynamics):
 
 def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
     """The problem as far as it was saved."""
-    double = arrays["problem.x_init"].dtype == np.float64
-    with jax.enable_x64(True) if double else nullcontext():
-        return _made(summary, arrays)
-
-
-def _made(summary: dict[str, Any], arrays: Arrays) -> Problem:
     x_init = jnp.asarray(arrays["problem.x_init"])
     stage, terminal = (
         arrays[f"solution.multipliers.constraints.{part}"].shape[-1]

@@ -10,15 +10,13 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from mjx_drax.method.descent import Info
 from mjx_drax.problem.tracing import require_functions
 from mjx_drax.search.iterate import FEASIBLE
-
-if TYPE_CHECKING:
-    from mjx_drax.method.descent import Info
 
 COMPILING = "{desc}: compiling, first iterations [{elapsed}]"
 FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from html import escape
 
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
-from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
+from mjx_drax.solution.results import STALLED, UNFINISHED, Results
 from mjx_drax.solution.violations import GOAL, TRACKING, words
 
 OPTIMA = 5
@@ -114,18 +115,14 @@ def optima_lines(solution: Results) -> list[str]:
     for rank, optimum in enumerate(found[:OPTIMA], 1):
         replays = optimum.certificate.open_loop, optimum.certificate.feedback
         open_loop, feedback = (outcomes[replay["success"]] for replay in replays)
+        residual = "-" if math.isnan(optimum.residual) else f"{optimum.residual:.1e}"
         table.append(
             f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback:13}  "
-            f"{_residual(optimum)}"
+            f"{residual}"
         )
     if len(found) > OPTIMA:
         table.append(f"{'':14} and {len(found) - OPTIMA} more")
     return table
-
-
-def _residual(optimum: Optimum) -> str:
-    known = optimum.residual == optimum.residual  # NaN is not equal to itself
-    return f"{optimum.residual:.1e}" if known else "-"
 
 
 def _advice(solution: Results) -> str:

@@ -37,6 +37,9 @@ FORMAT = 3
 WHOLE = ("trajectories", "multipliers", "gains", "plan", "open_loop", "feedback")
 """Attributes of a solution that are written for all chains, by their names."""
 
+CHAIN = ("cost", "max_defect", "max_violation", "residual", "feasible_since", "died_at")
+"""Numbers of every chain, by their names in a solution."""
+
 PICTURES = 5_000_000
 """Bytes that pictures and videos may take."""
 
@@ -50,6 +53,7 @@ def summary(solution: Results) -> dict[str, Any]:
     status, polished = solution.status, solution.polished
     dynamics = solution.problem.dynamics
     own = dynamics.inner if isinstance(dynamics, Extended) else dynamics
+    of_vectors = type(own).difference is Dynamics.difference
     model = mjx_dynamics(dynamics)
     where = solution.where(best)
     whole: dict[str, Any] = {
@@ -63,7 +67,7 @@ def summary(solution: Results) -> dict[str, Any]:
         "dt": float(solution.problem.dynamics.dt),
         "has_goal": solution.problem.goal is not None,
         "contacts": None if model is None else model.contacts,
-        "vector_states": dynamics.nx == dynamics.ndx and not _of_a_manifold(dynamics),
+        "vector_states": dynamics.nx == dynamics.ndx and of_vectors,
         "names": {"x_names": own.x_names, "u_names": own.u_names},
         "free": solution.problem.free,
         "extended": extended_data(dynamics),
@@ -99,11 +103,6 @@ def summary(solution: Results) -> dict[str, Any]:
     }
     data: dict[str, Any] = json_data(whole)
     return data
-
-
-def _of_a_manifold(dynamics: Dynamics) -> bool:
-    own = dynamics.inner if isinstance(dynamics, Extended) else dynamics
-    return type(own).difference is not Dynamics.difference
 
 
 def extended_data(dynamics: Dynamics) -> dict[str, Any] | None:
@@ -150,16 +149,11 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
         "optima_states": solution.plans[ways],
         "optima_controls": solution.trajectories.u[ways],
         "chain_optimum": optimum_of,
-        "chain_cost": solution.cost,
-        "chain_max_defect": solution.max_defect,
-        "chain_max_violation": solution.max_violation,
+        **{f"chain_{name}": getattr(solution, name) for name in CHAIN},
+        "chain_stalled": solution.stalled,
         "chain_success": solution.success,
         "chain_status": np.array(solution.status),
         "chain_replay_cost": solution.replay_cost,
-        "chain_residual": solution.residual,
-        "chain_stalled": solution.stalled,
-        "chain_feasible_since": solution.feasible_since,
-        "chain_died_at": solution.died_at,
         **{f"history_{name}": values for name, values in solution.history.items()},
     }
 

@@ -326,7 +326,6 @@ def _measured(
     limits: tuple[tuple[Array, ...], Array],
 ) -> tuple[Array, tuple[Array, ...]]:
     """Cost (n,); size, tolerance, entry and knot of the largest violation, (kinds, n) each."""
-    given, relative = limits
 
     def of_motion(own: Problem, motion: tuple[Array, Array], off: Array, extent: Any) -> Any:
         states, u = motion
@@ -334,14 +333,8 @@ def _measured(
         start = problem.start_from(states[0])
         if not problem.free:
             problem = replace(problem, x_init=states[0])
-        least = (STILL * width for width in scatter_widths(problem))
-        E = tuple(map(jnp.maximum, extent, least))
-        worst = []
-        for (size, scale, first), number in zip(
-            _sizes_and_scales(problem, states, u, off, E), given, strict=True
-        ):
-            allowed = jnp.where(jnp.isnan(number), relative * scale, number)
-            worst.append(_largest(size, jnp.broadcast_to(allowed, size.shape), first))
+        kinds = _sizes_and_tolerances(problem, motion, off, extent, limits)
+        worst = [_largest(*kind) for kind in kinds]
         cost = problem.cost(Trajectory(states[1:], u, start=start))
         return cost, tuple(map(jnp.stack, zip(*worst, strict=True)))
 
@@ -364,6 +357,22 @@ def scatter_widths(problem: Problem) -> tuple[Array, Array, Array]:
 
     x, u = width(box.x_lower, box.x_upper), width(box.u_lower, box.u_upper)
     return usable(x), usable(problem.dynamics.tangent(x)), usable(u)
+
+
+def _sizes_and_tolerances(
+    problem: Problem,
+    motion: tuple[Array, Array],
+    off: Array,
+    extent: tuple[Array, ...],
+    limits: tuple[tuple[Array, ...], Array],
+) -> Iterator[tuple[Array, Array, int]]:
+    """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
+    given, relative = limits
+    E = tuple(map(jnp.maximum, extent, (STILL * width for width in scatter_widths(problem))))
+    parts = _sizes_and_scales(problem, *motion, off, E)
+    for (size, scale, first), number in zip(parts, given, strict=True):
+        allowed = jnp.where(jnp.isnan(number), relative * scale, number)
+        yield size, jnp.broadcast_to(allowed, size.shape), first
 
 
 def _sizes_and_scales(
@@ -469,16 +478,9 @@ def _by_entry(
     limits: tuple[tuple[Array, ...], Array],
 ) -> list[tuple[Array, Array, int]]:
     """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
-    (states, u), (given, relative) = motion, limits
     if not problem.free:
-        problem = replace(problem, x_init=states[0])
-    E = tuple(map(jnp.maximum, extent, (STILL * width for width in scatter_widths(problem))))
-    found = []
-    parts = _sizes_and_scales(problem, states, u, off, E)
-    for (size, scale, first), number in zip(parts, given, strict=True):
-        allowed = jnp.where(jnp.isnan(number), relative * scale, number)
-        found.append((size, jnp.broadcast_to(allowed, size.shape), first))
-    return found
+        problem = replace(problem, x_init=motion[0][0])
+    return list(_sizes_and_tolerances(problem, motion, off, extent, limits))
 
 
 def worst_knots(

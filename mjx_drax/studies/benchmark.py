@@ -18,7 +18,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 
@@ -29,6 +29,7 @@ from mjx_drax.kernels.compilation import keep_none
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Diagonal
 from mjx_drax.method.schedules import Geometric
+from mjx_drax.problem.problem import Problem
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.search.sizes import scale_at
 from mjx_drax.studies import one_thread
@@ -52,11 +53,8 @@ from mjx_drax.studies.other_methods.ipopt import (
 )
 from mjx_drax.studies.other_methods.mbd import MBD
 from mjx_drax.studies.other_methods.mppi import MPPI
+from mjx_drax.studies.other_methods.shooting import Method
 from mjx_drax.studies.reproduce.settings import PENDULUM_FLOW, TRAP_FLOW
-
-if TYPE_CHECKING:
-    from mjx_drax.problem.problem import Problem
-    from mjx_drax.studies.other_methods.shooting import Method
 
 GPU_CHAINS = {
     "pendulum": 16_384,

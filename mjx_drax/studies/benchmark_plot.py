@@ -13,17 +13,15 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.view.plotting import BLACK, BLUE, DPI, GREEN, ORANGE, PURPLE, SKY, VERMILLION
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 STYLES: dict[str, dict[str, Any]] = {
     "mjx_drax": {"color": BLUE, "lw": 2.4, "marker": "o"},

@@ -33,7 +33,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,9 +53,7 @@ from mjx_drax.solution.solve import solve
 from mjx_drax.solution.violations import Tolerances
 from mjx_drax.studies.many_starts import solve_each
 from mjx_drax.studies.other_methods import shooting
-
-if TYPE_CHECKING:
-    from mjx_drax.studies.other_methods.ipopt import Transcription
+from mjx_drax.studies.other_methods.ipopt import Transcription
 
 Row = dict[str, Any]
 
@@ -257,8 +255,6 @@ def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | Non
     Raises:
         DraxError: casadi is not installed, or the problem is not written for it.
     """
-    from mjx_drax.studies.other_methods.ipopt import Transcription
-
     clock = time.perf_counter()
     program = program or Transcription(problem)
     building = time.perf_counter() - clock

@@ -12,17 +12,24 @@ import os
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import between, finite, interpolated, moved
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.view.drawing import Canvas, knot_at
+from mjx_drax.search.recording import Path as ChainHistory
+from mjx_drax.solution.solution import Solution
+from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
     Frame,
     caption_height,
@@ -35,13 +42,6 @@ from mjx_drax.view.geoms import Floats
 from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import FREE, Scene, body_positions, camera_for, travelling_body
 from mjx_drax.view.video import check, frame_times, outcome_lines
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from mjx_drax.search.recording import Path as ChainHistory
-    from mjx_drax.solution.solution import Solution
-    from mjx_drax.view.drawing import Draw
 
 COLORS = ("#56B4E9", "#E8D44D", "#F0902A", "#C8400A")
 """Colors of defects, from feasible to the worst: blue to orange, safe for colour-blind readers."""
@@ -228,8 +228,6 @@ class Colors:
 
     def __call__(self, defects: npt.ArrayLike) -> Floats:
         """RGBA (..., 4) of defects (...,)."""
-        from matplotlib.colors import LinearSegmentedColormap
-
         low, high = np.log10([FEASIBLE, self.worst])
         logs = np.log10(np.maximum(np.nan_to_num(defects, nan=self.worst), FEASIBLE))
         share = np.clip((logs - low) / (high - low), 0.0, 1.0)
@@ -319,8 +317,6 @@ def _robot_pictures(
 
 def _task_pictures(film: Film, draw: Draw, x_init: Floats) -> Iterator[Frame]:
     """The chains' paths on what a task draws."""
-    from matplotlib.collections import LineCollection
-
     points = [_traced(draw, chain.x.astype(float)) for chain in film.shown]
     width, height = film.size
     canvas = Canvas(height, width, layout="constrained")
@@ -361,8 +357,6 @@ def _task_pictures(film: Film, draw: Draw, x_init: Floats) -> Iterator[Frame]:
 
 def _traced(draw: Draw, states: Floats) -> Floats:
     """Where `draw` puts states (..., nx) on its axes, (..., 2): the line with a vertex for each."""
-    from matplotlib.figure import Figure
-
     axes, flat = Figure().add_subplot(), states.reshape(-1, states.shape[-1])
     draw(axes, flat)
     lines = [np.asarray(line.get_xydata()) for line in axes.lines]
@@ -410,8 +404,6 @@ class CurveStrip:
 
     def frame(self, at: float) -> Frame:
         """The curves with markers at a moment among the snapshots."""
-        from PIL import Image, ImageDraw
-
         image = Image.fromarray(self._picture)
         pen = ImageDraw.Draw(image)
         i, j, share = _neighbours(at, len(self._iterations))

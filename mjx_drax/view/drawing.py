@@ -12,8 +12,8 @@ from mjx_drax.view.frames import Frame
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    Draw = Callable[[Axes, np.ndarray], None]
-    """draw(axes, states (k + 1, nx)) draws the motion x_0..x_k."""
+Draw = Callable[["Axes", np.ndarray], None]
+"""draw(axes, states (k + 1, nx)) draws the motion x_0..x_k."""
 
 _INCHES = 5.0  # height of a frame: sets the size of its letters
 

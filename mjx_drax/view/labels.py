@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.solution.names import control_names, difference_names, state_names
-
-if TYPE_CHECKING:
-    from mjx_drax.problem.dynamics import Dynamics
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _UNITS = {mujoco.mjtJoint.mjJNT_SLIDE: "m", mujoco.mjtJoint.mjJNT_HINGE: "rad"}

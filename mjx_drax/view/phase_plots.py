@@ -9,15 +9,18 @@ from __future__ import annotations
 import os
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import between, finite
+from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.solution.solution import Solution
 from mjx_drax.view.geoms import Floats
 from mjx_drax.view.labels import coordinates, tangent_labels
 from mjx_drax.view.plotting import (
@@ -29,12 +32,6 @@ from mjx_drax.view.plotting import (
     panel_figure,
     save_figure,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from mjx_drax.problem.dynamics import Dynamics
-    from mjx_drax.solution.solution import Solution
 
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _DIVERGING = "RdBu_r"  # safe for colour-blind readers

@@ -13,10 +13,11 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -28,16 +29,12 @@ from mjx_drax.physics.states import finite
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.log import residuals
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
+from mjx_drax.solution.results import Optimum
 from mjx_drax.solution.solution import Solution
+from mjx_drax.view.drawing import Draw
 from mjx_drax.view.labels import control_labels, state_groups
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from mjx_drax.solution.results import Optimum
-    from mjx_drax.view.drawing import Draw
-
-    Panel = Callable[[Axes], None]
+Panel = Callable[[Axes], None]
 
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GRAY = "#0072B2", "#D55E00", "#CC79A7", "#767676"
@@ -340,10 +337,7 @@ def _draw_history(
 def _draw_defects(axes: Axes, solution: Solution) -> None:
     values = solution.history["max_defect"]
     handles = _draw_history(axes, solution, values, np.ones_like(values, bool), BLUE)
-    label = f"feasible: below {FEASIBLE:g}"
-    handles.append(axes.axhline(FEASIBLE, ls=":", lw=1.2, color=BLACK, label=label))
-    axes.set_yscale("log")
-    label_panel(axes, "max|h| of all chains", "iteration", handles)
+    _draw_limit(axes, "max|h| of all chains", "feasible", FEASIBLE, handles)
 
 
 def _draw_costs(axes: Axes, solution: Solution) -> None:
@@ -358,10 +352,15 @@ def _draw_residuals(axes: Axes, solution: Solution) -> None:
     values = residuals(solution.history)
     known = np.maximum(values, np.finfo(values.dtype).tiny)  # for the logarithm
     handles = _draw_history(axes, solution, known, np.isfinite(values), PURPLE)
-    label = f"optimal: below {solution.tolerance:g}"
-    handles.append(axes.axhline(solution.tolerance, ls=":", lw=1.2, color=BLACK, label=label))
+    _draw_limit(axes, "residual of polished chains", "optimal", solution.tolerance, handles)
+
+
+def _draw_limit(axes: Axes, title: str, word: str, limit: float, handles: Sequence[Artist]) -> None:
+    """What is below a limit has a name."""
+    label = f"{word}: below {limit:g}"
+    line = axes.axhline(limit, ls=":", lw=1.2, color=BLACK, label=label)
     axes.set_yscale("log")
-    label_panel(axes, "residual of polished chains", "iteration", handles)
+    label_panel(axes, title, "iteration", [*handles, line])
 
 
 def _draw_final_costs(axes: Axes, solution: Solution) -> None:

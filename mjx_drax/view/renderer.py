@@ -80,8 +80,8 @@ class _OpenGLRenderer:
             return frame[::-1]  # OpenGL counts rows from below
         depth = np.empty((self._rect.height, self._rect.width), np.float32)
         mujoco.mjr_readPixels(frame, depth, self._rect, self._mjr)
-        empty = _is_empty(depth)[::-1]
-        return np.where(empty[..., None], self._sky, frame[::-1])
+        empty = (depth <= 0.0) | (depth >= 1.0)  # MuJoCo may turn the direction of depths
+        return np.where(empty[::-1, :, None], self._sky, frame[::-1])
 
     def close(self) -> None:
         self._gl.make_current()
@@ -94,11 +94,6 @@ def _sky(height: int) -> Frame:
     share = np.linspace(0.0, 1.0, height)[:, None, None]
     above, below = np.array([120.0, 160.0, 205.0]), np.array([232.0, 238.0, 244.0])
     return np.asarray((1.0 - share) * above + share * below, np.uint8)
-
-
-def _is_empty(depth: np.ndarray) -> np.ndarray:
-    """Where nothing was drawn, (height, width): the depth there is that of the far plane."""
-    return (depth <= 0.0) | (depth >= 1.0)  # MuJoCo may turn the direction of depths
 
 
 def _is_software() -> bool:

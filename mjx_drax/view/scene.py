@@ -63,15 +63,10 @@ class Scene:
 
     def add_arrows(self, arrows: Sequence[Arrow]) -> None:
         """Red arrows, such as forces."""
-        zero, turn, kind = np.zeros(3), np.eye(3).ravel(), mujoco.mjtGeom.mjGEOM_ARROW
+        kind = mujoco.mjtGeom.mjGEOM_ARROW
         for start, vector in arrows:
-            if self.content.ngeom >= self.content.maxgeom:
-                return
-            geom = self.content.geoms[self.content.ngeom]
-            mujoco.mjv_initGeom(geom, kind, zero, zero, turn, np.float32(_RED))
-            width = 0.08 * float(np.linalg.norm(vector))
-            mujoco.mjv_connector(geom, kind, width, start, start + 2.0 * vector)  # draws half of it
-            self.content.ngeom += 1
+            width, end = 0.08 * float(np.linalg.norm(vector)), start + 2.0 * vector
+            self._connect(kind, width, start, end, _RED)  # draws half of it
 
     def add_robot(self, qpos: Floats, opacity: float, color: npt.ArrayLike | None = None) -> None:
         """One more robot, translucent, at qpos (nq,), in its own colors or in one (3,)."""
@@ -92,12 +87,16 @@ class Scene:
 
         width [pixels] with OpenGL; capsules would take ten times as long without a GPU.
         """
-        kind = mujoco.mjtGeom.mjGEOM_LINE
-        zero, turn = np.zeros(3), np.eye(3).ravel()
         for start, end, color in zip(points[:-1], points[1:], colors, strict=True):
-            if self.content.ngeom >= self.content.maxgeom:
-                return
+            self._connect(mujoco.mjtGeom.mjGEOM_LINE, width, start, end, color)
+
+    def _connect(
+        self, kind: mujoco.mjtGeom, width: float, start: Floats, end: Floats, color: Floats
+    ) -> None:
+        """A geom from one point to another, if the scene has room for it."""
+        if self.content.ngeom < self.content.maxgeom:
             geom = self.content.geoms[self.content.ngeom]
+            zero, turn = np.zeros(3), np.eye(3).ravel()
             mujoco.mjv_initGeom(geom, kind, zero, zero, turn, np.float32(color))
             mujoco.mjv_connector(geom, kind, width, start, end)
             self.content.ngeom += 1

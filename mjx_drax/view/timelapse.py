@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,15 +11,12 @@ from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.states import interpolated
-from mjx_drax.view.drawing import Canvas
+from mjx_drax.solution.solution import Solution
+from mjx_drax.view.drawing import Canvas, Draw
 from mjx_drax.view.frames import even_size
 from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import FREE, Scene, camera_for
 from mjx_drax.view.video import states_of
-
-if TYPE_CHECKING:
-    from mjx_drax.solution.solution import Solution
-    from mjx_drax.view.drawing import Draw
 
 _FIRST_OPACITY, _LAST_OPACITY = 0.12, 0.65  # of the poses before the last one, which is opaque
 

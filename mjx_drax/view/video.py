@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,10 @@ from mjx_drax.base.errors import DraxError, require_positive, shown
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import finite, interpolated
+from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.results import optimality
-from mjx_drax.view.drawing import Canvas, knot_at
+from mjx_drax.solution.solution import Solution
+from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
     UNCERTIFIED,
     Frame,
@@ -31,11 +33,6 @@ from mjx_drax.view.frames import (
 from mjx_drax.view.geoms import Floats
 from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import Arrow, Scene, camera_for
-
-if TYPE_CHECKING:
-    from mjx_drax.problem.problem import Problem
-    from mjx_drax.solution.solution import Solution
-    from mjx_drax.view.drawing import Draw
 
 _HOLD = 0.5  # [s] the last frame stays this long
 

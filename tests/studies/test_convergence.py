@@ -33,15 +33,15 @@ def test_published_solutions_of_programs_are_optimal(name):
     x = np.array(program.solution)
 
     def all_functions(x):
-        rows = [program.cost(x)]
-        rows += [*program.equality(x)] if program.equality else []
-        rows += [*program.inequality(x)] if program.inequality else []
+        rows = [program.cost(*x)]
+        rows += [*program.equality(*x)] if program.equality else []
+        rows += [*program.inequality(*x)] if program.inequality else []
         return (jnp.stack(rows),) * 2
 
     J, values = jax.jit(jax.jacfwd(all_functions, has_aux=True))(x)
     (cost, *values), (slope, *slopes) = np.asarray(values), np.asarray(J)
     assert cost == pytest.approx(program.optimum, rel=1e-5, abs=1e-8)
-    equalities = len(program.equality(x)) if program.equality else 0
+    equalities = len(program.equality(*x)) if program.equality else 0
     assert np.abs(values[:equalities]).max(initial=0) < 1e-4
     assert np.max(values[equalities:], initial=0) < 1e-4
     rows, pushes = [np.zeros((0, x.size))], []

@@ -17,12 +17,19 @@ from jax import Array
 from mjx_drax.problem.build import from_function
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Knot
-from mjx_drax.studies.convergence.optimal_control import Case, Rate, integral, runge_kutta
+from mjx_drax.studies.convergence.optimal_control import (
+    Case,
+    Rate,
+    bead,
+    integral,
+    rocket,
+    runge_kutta,
+)
 
 COPS = "COPS of Dolan, More and Munson, 2004"
 
 
-def in_time(rate: Rate, **rest: Any) -> Problem:
+def in_time(rate: Rate, nu: int = 1, **rest: Any) -> Problem:
     """A problem of free duration: x' = rate(x, u); without a cost of its own, of least time."""
 
     def f(x: Array, u: Array, knot: Knot) -> Array:
@@ -30,7 +37,7 @@ def in_time(rate: Rate, **rest: Any) -> Problem:
 
     if "terminal_cost" not in rest:
         rest["running_cost"] = lambda x, u, knot: knot.dt
-    return from_function(f, **rest)
+    return from_function(f, nu=nu, **rest)
 
 
 def double_integrator_time() -> Problem:
@@ -38,12 +45,10 @@ def double_integrator_time() -> Problem:
     return in_time(
         lambda x, u: jnp.array([x[1], u[0]]),
         x_init=[0.0, 0.0],
-        nu=1,
         horizon=(0.5, 5.0),
         knots=40,
         terminal_equality=lambda x: x - jnp.array([1.0, 0.0]),
         u_bounds=(-1.0, 1.0),
-        name="double_integrator_time",
     )
 
 
@@ -52,27 +57,23 @@ def there_and_back() -> Problem:
     return in_time(
         lambda x, u: jnp.array([x[1], u[0]]),
         x_init=[0.0, 0.0],
-        nu=1,
         horizon=[(0.5, 5.0), (0.5, 5.0)],
         knots=[20, 20],
         equality=lambda x, u, knot: jnp.where(knot.index == 20, x[:1] - 1.0, 0.0),
         terminal_equality=lambda x: x,
         u_bounds=(-1.0, 1.0),
-        name="there_and_back",
     )
 
 
 def brachistochrone_time() -> Problem:
     """A bead slides 10 m sideways and 5 m down; x = [sideways, down, speed], u from down."""
     return in_time(
-        lambda x, u: jnp.array([x[2] * jnp.sin(u[0]), x[2] * jnp.cos(u[0]), 9.81 * jnp.cos(u[0])]),
+        bead,
         x_init=[0.0, 0.0, 0.0],
-        nu=1,
         horizon=(0.5, 5.0),
         knots=60,
         terminal_equality=lambda x: x[:2] - jnp.array([10.0, 5.0]),
         u_bounds=(-np.pi, np.pi),
-        name="brachistochrone_time",
     )
 
 
@@ -97,12 +98,10 @@ def zermelo() -> Problem:
     return in_time(
         lambda x, u: jnp.array([jnp.cos(u[0]) - x[1], jnp.sin(u[0])]),
         x_init=[-away, sec[0] - sec[1]],
-        nu=1,
         horizon=(1.0, 15.0),
         knots=60,
         terminal_equality=lambda x: x,
         u_bounds=(0.0, 2 * np.pi),
-        name="zermelo",
     )
 
 
@@ -111,12 +110,10 @@ def dubins() -> Problem:
     return in_time(
         lambda x, u: jnp.array([jnp.cos(x[2]), jnp.sin(x[2]), u[0]]),
         x_init=[0.0, 0.0, 0.0],
-        nu=1,
         horizon=(1.0, 15.0),
         knots=60,
         terminal_equality=lambda x: x - jnp.array([0.0, 4.0, np.pi]),
         u_bounds=(-1.0, 1.0),
-        name="dubins",
     )
 
 
@@ -125,33 +122,23 @@ def particle_steering() -> Problem:
     return in_time(
         lambda x, u: jnp.array([x[2], x[3], 100 * jnp.cos(u[0]), 100 * jnp.sin(u[0])]),
         x_init=[0.0, 0.0, 0.0, 0.0],
-        nu=1,
         horizon=(0.1, 2.0),
         knots=60,
         terminal_equality=lambda x: x[1:] - jnp.array([5.0, 45.0, 0.0]),
         u_bounds=(-np.pi / 2, np.pi / 2),
-        name="particle_steering",
     )
 
 
 def goddard_time() -> Problem:
     """The rocket of `optimal_control.goddard`, until it is highest; x = [height, speed, mass]."""
-
-    def rate(x: Array, u: Array) -> Array:
-        h, v, m = x
-        drag = 310.0 * v**2 * jnp.exp(500.0 * (1 - h))
-        return jnp.array([v, (u[0] - drag) / m - 1 / h**2, -2.0 * u[0]])
-
     return in_time(
-        rate,
+        rocket,
         x_init=[1.0, 0.0, 1.0],
-        nu=1,
         horizon=(0.05, 0.4),
         knots=100,
         terminal_cost=lambda x: -x[0],
         x_bounds=([1.0, 0.0, 0.6], np.inf),
         u_bounds=(0.0, 3.5),
-        name="goddard_time",
     )
 
 
@@ -173,7 +160,6 @@ def robot_arm_time() -> Problem:
         terminal_equality=lambda x: x - end,
         x_bounds=([0.0, -np.pi, 0.0] + [-np.inf] * 3, [5.0, np.pi, np.pi] + [np.inf] * 3),
         u_bounds=(-1.0, 1.0),
-        name="robot_arm_time",
     )
 
 
@@ -193,14 +179,12 @@ def hang_glider() -> Problem:
     return in_time(
         rate,
         x_init=[0.0, 1000.0, *end[1:]],
-        nu=1,
         horizon=(50.0, 150.0),
         knots=100,
         terminal_cost=lambda x: -x[0],
         terminal_equality=lambda x: x[1:] - end,
         x_bounds=([0.0, -np.inf, 0.0, -np.inf], np.inf),
         u_bounds=(0.0, 1.4),
-        name="hang_glider",
     )
 
 
@@ -225,7 +209,6 @@ def forced_oscillator() -> Problem:
         running_cost=lambda x, u, knot: whole(jnp.append(x, knot.time), u),
         terminal_equality=lambda x, knot: x - knot.x_init,
         u_bounds=(-5.0, 5.0),
-        name="forced_oscillator",
     )
 
 
@@ -250,12 +233,11 @@ def tracking() -> Problem:
         horizon=2.5 * np.pi,
         running_cost=cost,
         data=lambda t: jnp.sin(t + dt * shares),
-        name="tracking",
     )
 
 
 def estimation(
-    rate: Any, begins: list[float], times: np.ndarray, measured: np.ndarray, upper: Any, **rest: Any
+    rate: Any, begins: list[float], times: np.ndarray, measured: np.ndarray, upper: Any
 ) -> Problem:
     """Parameters of x' = rate(x, p) for which x(times) is next to `measured`, by least squares.
 
@@ -265,7 +247,6 @@ def estimation(
         times: ends of steps, (K,) [s].
         measured: x at those times, (K, nx), NaN where it is not measured.
         upper: ends of the parameters, (np,); the lower ones are 0.
-        rest: the name.
     """
     known = np.isfinite(measured)
     rows = {
@@ -291,7 +272,6 @@ def estimation(
         terminal_residual=off,
         parameters={"p": (0.0, np.asarray(upper))},
         data=rows,
-        **rest,
     )
 
 
@@ -329,7 +309,6 @@ def gas_oil() -> Problem:
         [1.0, 0.0],
         *table(GAS_OIL, 2, 2),
         np.full(3, 20.0),
-        name="gas_oil",
     )
 
 
@@ -346,7 +325,6 @@ def alpha_pinene() -> Problem:
         [100.0, 0.0, 0.0, 0.0, 0.0],
         *table(PINENE, 5, 6),
         np.full(5, 50.0),
-        name="alpha_pinene",
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -88,44 +89,47 @@ def integral(rate: Rate, density: Rate, dt: Array | float) -> Rate:
     return cost
 
 
+def held(
+    rate: Rate, density: Rate | None = None, *, dt: float, nu: int = 1, **rest: Any
+) -> Problem:
+    """A problem with steps of `runge_kutta` and, if a density is given, its integral as cost."""
+    if density is not None:
+        rest["running_cost"] = integral(rate, density, dt)
+    return from_function(runge_kutta(rate, dt), nu=nu, dt=dt, **rest)
+
+
 def van_der_pol(constrained: bool = False) -> Problem:
     """An oscillator with negative damping; constrained: x_1 >= -1/4, and at rest at the end."""
-    dt = 0.1
 
     def rate(x: Array, u: Array) -> Array:
         return jnp.array([(1 - x[1] ** 2) * x[0] - x[1] + u[0], x[0]])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
+        lambda x, u: jnp.sum(x**2) + u[0] ** 2,
         x_init=[0.0, 1.0],
-        nu=1,
-        dt=dt,
+        dt=0.1,
         horizon=10.0,
-        running_cost=integral(rate, lambda x, u: jnp.sum(x**2) + u[0] ** 2, dt),
         inequality=(lambda x, u: -0.25 - x[:1]) if constrained else None,
         terminal_equality=(lambda x: x) if constrained else None,
         u_bounds=(-1.0, 1.0),
-        name="van_der_pol_constrained" if constrained else "van_der_pol",
     )
 
 
 def rayleigh() -> Problem:
     """Current of an oscillator with a tunnel diode."""
-    dt = 0.05
 
     def rate(x: Array, u: Array) -> Array:
         return jnp.array([x[1], -x[0] + x[1] * (1.4 - 0.14 * x[1] ** 2) + 4 * u[0]])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
+        lambda x, u: x[0] ** 2 + u[0] ** 2,
         x_init=[-5.0, -5.0],
-        nu=1,
-        dt=dt,
+        dt=0.05,
         horizon=4.5,
-        running_cost=integral(rate, lambda x, u: x[0] ** 2 + u[0] ** 2, dt),
         terminal_equality=lambda x: x,
         u_bounds=(-1.0, 1.0),
-        name="rayleigh",
     )
 
 
@@ -134,26 +138,22 @@ def hanging_chain() -> Problem:
 
     The place along the ground stands for time; x = [height, length so far], u = slope.
     """
-    dt = 0.01
 
     def rate(x: Array, u: Array) -> Array:
         return jnp.array([u[0], jnp.sqrt(1 + u[0] ** 2)])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
+        lambda x, u: x[0] * jnp.sqrt(1 + u[0] ** 2),
         x_init=[1.0, 0.0],
-        nu=1,
-        dt=dt,
+        dt=0.01,
         horizon=1.0,
-        running_cost=integral(rate, lambda x, u: x[0] * jnp.sqrt(1 + u[0] ** 2), dt),
         terminal_equality=lambda x: x - jnp.array([3.0, 4.0]),
-        name="hanging_chain",
     )
 
 
 def crane() -> Problem:
     """A container crane moves its load from a ship to a truck, with little swing and effort."""
-    dt = 0.1
 
     def rate(x: Array, u: Array) -> Array:
         swing = -(u[0] + 27.0756 * x[2] + 2 * x[4] * x[5]) / x[1]
@@ -162,17 +162,16 @@ def crane() -> Problem:
     def swing_and_effort(x: Array, u: Array) -> Array:
         return 0.5 * (x[2] ** 2 + x[5] ** 2 + 0.01 * jnp.sum(u**2))
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
+        swing_and_effort,
         x_init=[0.0, 22.0, 0.0, 0.0, -1.0, 0.0],
         nu=2,
-        dt=dt,
+        dt=0.1,
         horizon=9.0,
-        running_cost=integral(rate, swing_and_effort, dt),
         terminal_equality=lambda x: x - jnp.array([10.0, 14.0, 0.0, 2.5, 0.0, 0.0]),
         x_bounds=([-np.inf] * 3 + [-2.5, -1.0, -np.inf], [np.inf] * 3 + [2.5, 1.0, np.inf]),
         u_bounds=([-2.83374, -0.80865], [2.83374, 0.71265]),
-        name="crane",
     )
 
 
@@ -188,8 +187,8 @@ def robot_arm() -> Problem:
         second = second + 1.5 * c * (u[0] - u[1])
         return jnp.array([first / below, -second / below, x[1] - x[0], x[0]])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
         x_init=[0.0, 0.0, 0.5, 0.0],
         nu=2,
         dt=dt,
@@ -197,68 +196,58 @@ def robot_arm() -> Problem:
         running_residual=lambda x, u: np.sqrt(2 * dt) * u,
         terminal_equality=lambda x: x - jnp.array([0.0, 0.0, 0.5, 0.522]),
         u_bounds=(-1.0, 1.0),
-        name="robot_arm",
     )
 
 
 def catalytic_cracker() -> Problem:
     """Two catalysts are mixed along a reactor, for the most product; a part of u is singular."""
-    dt = 0.01
 
     def rate(x: Array, u: Array) -> Array:
         first = u[0] * (10 * x[1] - x[0])
         return jnp.array([first, -first - (1 - u[0]) * x[1]])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
         x_init=[1.0, 0.0],
-        nu=1,
-        dt=dt,
+        dt=0.01,
         horizon=1.0,
         terminal_cost=lambda x: x[0] + x[1] - 1,
         u_bounds=(0.0, 1.0),
-        name="catalytic_cracker",
     )
 
 
 def batch_reactor() -> Problem:
     """A -> B -> C, with as much B as possible; u is the temperature [100 K]."""
-    dt = 0.02
 
     def rate(x: Array, u: Array) -> Array:
         made = 4000 * jnp.exp(-25 / u[0]) * x[0] ** 2
         return jnp.array([-made, made - 620000 * jnp.exp(-50 / u[0]) * x[1]])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
         x_init=[1.0, 0.0],
-        nu=1,
-        dt=dt,
+        dt=0.02,
         horizon=1.0,
         terminal_cost=lambda x: -x[1],
         u_bounds=(2.98, 3.98),
-        name="batch_reactor",
     )
 
 
 def stirred_tank() -> Problem:
     """A stirred-tank reactor is brought back to its unstable steady state."""
-    dt = 0.02
 
     def rate(x: Array, u: Array) -> Array:
         reaction = (x[1] + 0.5) * jnp.exp(25 * x[0] / (x[0] + 2))
         return jnp.array([-(2 + u[0]) * (x[0] + 0.25) + reaction, 0.5 - x[1] - reaction])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
+        lambda x, u: jnp.sum(x**2) + 0.1 * u[0] ** 2,
         x_init=[0.09, 0.09],
-        nu=1,
-        dt=dt,
+        dt=0.02,
         horizon=0.78,
-        running_cost=integral(rate, lambda x, u: jnp.sum(x**2) + 0.1 * u[0] ** 2, dt),
         x_bounds=(-1.0, 1.0),  # further off the reaction's rate overflows
         u_bounds=(-20.0, 20.0),
-        name="stirred_tank",
     )
 
 
@@ -269,18 +258,23 @@ def bryson_denham() -> Problem:
     def rate(x: Array, u: Array) -> Array:
         return jnp.array([x[1], u[0]])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
         x_init=[0.0, 1.0],
-        nu=1,
         dt=dt,
         horizon=1.0,
         running_residual=lambda x, u: np.sqrt(dt) * u,
         terminal_equality=lambda x: x - jnp.array([0.0, -1.0]),
         x_bounds=(-np.inf, [1 / 9, np.inf]),
         u_bounds=(-20.0, 20.0),
-        name="bryson_denham",
     )
+
+
+def rocket(x: Array, u: Array) -> Array:
+    """x' of `goddard`, in units of the start; x = [height, speed, mass]."""
+    h, v, m = x
+    drag = 310.0 * v**2 * jnp.exp(500.0 * (1 - h))
+    return jnp.array([v, (u[0] - drag) / m - 1 / h**2, -2.0 * u[0]])
 
 
 def goddard() -> Problem:
@@ -289,42 +283,31 @@ def goddard() -> Problem:
     Height counts from the earth's middle; all units are those of the start. A part of u, the
     thrust, is singular.
     """
-    dt = 0.002
-
-    def rate(x: Array, u: Array) -> Array:
-        h, v, m = x
-        drag = 310.0 * v**2 * jnp.exp(500.0 * (1 - h))
-        return jnp.array([v, (u[0] - drag) / m - 1 / h**2, -2.0 * u[0]])
-
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rocket,
         x_init=[1.0, 0.0, 1.0],
-        nu=1,
-        dt=dt,
+        dt=0.002,
         horizon=0.2,
         terminal_cost=lambda x: -x[0],
         x_bounds=([1.0, -np.inf, 0.6], np.inf),
         u_bounds=(0.0, 3.5),
-        name="goddard",
     )
+
+
+def bead(x: Array, u: Array) -> Array:
+    """x' of a bead on a wire; x = [sideways, down, speed], u is the angle from down."""
+    return jnp.array([x[2] * jnp.sin(u[0]), x[2] * jnp.cos(u[0]), 9.81 * jnp.cos(u[0])])
 
 
 def brachistochrone() -> Problem:
     """A bead on a wire gets as far sideways as it can in a second; u is the angle from down."""
-    dt = 0.02
-
-    def rate(x: Array, u: Array) -> Array:
-        return jnp.array([x[2] * jnp.sin(u[0]), x[2] * jnp.cos(u[0]), 9.81 * jnp.cos(u[0])])
-
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        bead,
         x_init=[0.0, 0.0, 0.0],
-        nu=1,
-        dt=dt,
+        dt=0.02,
         horizon=1.0,
         terminal_cost=lambda x: -x[0],
         u_bounds=(-np.pi, np.pi),
-        name="brachistochrone",
     )
 
 
@@ -340,16 +323,14 @@ def orbit_transfer() -> Problem:
         faster_along = -out * along / r + push * jnp.cos(u[0])
         return jnp.array([out, faster_out, faster_along, -0.0749])
 
-    return from_function(
-        runge_kutta(rate, dt),
+    return held(
+        rate,
         x_init=[1.0, 0.0, 1.0, 1.0],
-        nu=1,
         dt=dt,
         horizon=duration,
         terminal_cost=lambda x: -x[0],
         terminal_equality=lambda x: jnp.array([x[1], x[2] - 1 / jnp.sqrt(x[0])]),
         u_bounds=(-np.pi, np.pi),
-        name="orbit_transfer",
     )
 
 
@@ -373,7 +354,6 @@ def unicycle_discs() -> Problem:
         inequality=inside,
         terminal_equality=lambda x: x - jnp.array([2.0, 2.0, np.pi / 2]),
         u_bounds=(-1.5, 1.5),
-        name="unicycle_discs",
     )
 
 
@@ -404,7 +384,6 @@ def car_parking() -> Problem:
         running_cost=running,
         terminal_cost=lambda x: jnp.sum(smooth(x, jnp.array([0.1, 0.1, 0.01, 1.0]))),
         u_bounds=([-0.5, -2.0], [0.5, 2.0]),
-        name="car_parking",
     )
 
 
@@ -429,7 +408,6 @@ def cartpole_euler() -> Problem:
         running_residual=lambda x, u: jnp.append(np.sqrt(0.2) * (x - goal), np.sqrt(0.02) * u),
         terminal_residual=lambda x: np.sqrt(2000.0) * (x - goal),
         u_bounds=(-5.0, 5.0),
-        name="cartpole_euler",
     )
 
 

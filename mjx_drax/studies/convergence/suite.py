@@ -20,6 +20,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def posed(name: str) -> tuple[Problem, Trajectory]:
         DraxError: there is no such problem.
     """
     if name in CASES:
-        problem = CASES[name].make()
+        problem = replace(CASES[name].make(), name=name)
         return problem, CASES[name].guess(problem)
     if name in TASKS:
         problem = tasks.load(name).make()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_drax import tasks
@@ -23,9 +24,6 @@ from mjx_drax.studies.reproduce.output import (
 )
 from mjx_drax.studies.reproduce.settings import NO_NOISE, with_budget
 from mjx_drax.view.plotting import BLACK, BLUE, GREEN, VERMILLION
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 FULL = {"chains": 256}
 """Sizes with --full: those of the numbers in docs/paper.md."""

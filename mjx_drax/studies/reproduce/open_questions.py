@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_drax import tasks
@@ -32,9 +32,6 @@ from mjx_drax.studies.reproduce.output import (
 )
 from mjx_drax.studies.reproduce.settings import budget_of, initial_knots, with_budget
 from mjx_drax.view.plotting import BLACK, CURVES, GRAY, SKY
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 FULL = {"chains": 256}
 """Sizes with --full."""

@@ -5,16 +5,14 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.plotting import DPI
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Numbers = dict[str, Any]
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_drax import tasks
@@ -24,9 +23,6 @@ from mjx_drax.studies.reproduce.output import (
     tell,
 )
 from mjx_drax.view.plotting import BLACK, BLUE, GRAY, GREEN, ORANGE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 def make(chains: int = 64, iterations: int | None = None) -> tuple[Numbers, Figure]:
