@@ -11,7 +11,6 @@ first row's solve time has work that is done once in a process.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 import jax
@@ -51,7 +50,7 @@ def line(solution: Solution) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Solve and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("tasks", nargs="*", default=DEFAULT)
@@ -66,8 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 line(solve(problem, chains=int(chains or 64), seed=seed, progress=False)),
                 flush=True,
             )
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -17,11 +17,20 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
 
-from mjx_drax.view.plotting import BLACK, BLUE, DPI, GREEN, ORANGE, PURPLE, SKY, VERMILLION
+from mjx_drax.view.plotting import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    label_axes,
+    label_decades,
+    new_figure,
+    save_figure,
+)
 
 STYLES: dict[str, dict[str, Any]] = {
     "mjx_drax": {"color": BLUE, "lw": 2.4, "marker": "o"},
@@ -51,7 +60,7 @@ def plot(rows: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
         panels.setdefault(panel, {}).setdefault(label, []).append(row)
     columns = max(min(COLUMNS, len(panels)), 1)
     height = -(-max(len(panels), 1) // columns)
-    figure = Figure((3.6 * columns, 3.1 * height + 0.9), DPI, layout="constrained", facecolor="w")
+    figure = new_figure(3.6 * columns, 3.1 * height + 0.9)
     axes = np.ravel(figure.subplots(height, columns, squeeze=False))
     for axis, (title, methods) in zip(axes, panels.items(), strict=False):
         _panel(axis, title, methods)
@@ -65,9 +74,7 @@ def plot(rows: Sequence[dict[str, Any]], path: str | os.PathLike[str]) -> Path:
             ncols=3 * columns,
             fontsize=8,
         )
-    target = Path(path)
-    FigureCanvasAgg(figure).print_png(target)
-    return target
+    return save_figure(figure, path)
 
 
 def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> None:
@@ -90,19 +97,13 @@ def _panel(axes: Axes, title: str, methods: dict[str, list[dict[str, Any]]]) -> 
             **style,
         )
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
+    label_decades(axes.xaxis)
     if ends:
         axes.set_xlim(0.7 * min(ends), 1.4 * max(ends))
     axes.set_ylim(0.0, 1.0)
     axes.set_yticks(np.linspace(0, 1, 6), [f"{tick:.0%}" for tick in np.linspace(0, 1, 6)])
     axes.set_title(title, loc="left", fontsize=9, fontweight="bold")
-    axes.set_xlabel("solving time [s]", fontsize=8)
-    axes.set_ylabel("certified, cost at most 2 × best known", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.grid(True, color="0.9", lw=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
+    label_axes(axes, "solving time [s]", "certified, cost at most 2 × best known")
     if failed:
         label = fill("never: " + ", ".join(failed), 30)  # beside the title, on two lines if long
         axes.set_title(label, loc="right", fontsize=7)

@@ -53,7 +53,7 @@ def times(name: str, chains: int, repeats: int) -> tuple[list[float], float]:
     return seconds, compiling
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Time and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("tasks", nargs="*", default=TASKS, metavar="TASK[:CHAINS]")
@@ -67,8 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seconds, compiling = times(name, int(chains or 32), options.repeats)
         row = " | ".join(f"{1e3 * part:.2f}" for part in seconds)
         print(f"| {name} | {chains or 32} | {row} | {compiling:.0f} |", flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

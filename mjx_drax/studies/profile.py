@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -79,7 +78,7 @@ def measured(problem: Problem, chains: int, solver: Restarts, iterations: int, r
     print(flush=True)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Profile and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("tasks", nargs="+", metavar="TASK[:CHAINS]")
@@ -99,8 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 continue
             print(f"\n## {name}, {chains or 64} chains, {what}\n")
             measured(problem, int(chains or 64), solver, n, rows)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

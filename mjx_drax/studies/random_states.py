@@ -15,7 +15,6 @@ controls that attain the minimum.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -95,7 +94,7 @@ def line(found: BatchSolution, chains: int, seed: int, best: np.ndarray, can: np
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Solve and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--states", type=int, default=16_384, metavar="N")
@@ -112,8 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in range(options.seeds):
             found = solve_batch(lambda x: replace(problem, x_init=x), x, chains, seed)
             print(line(found, chains, seed, best, can), flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

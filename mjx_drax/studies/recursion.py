@@ -58,7 +58,7 @@ def timed(step: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) ->
     return float(np.median(seconds)), out
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Time and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("sizes", nargs="*", default=SIZES, metavar="NDXxNU")
@@ -79,8 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             apart = float(jnp.max(jnp.abs(found.dx - wanted.dx)) / jnp.max(jnp.abs(wanted.dx)))
             row = f"| {ndx}, {nu} | {chains:,} | {1e3 * before:.3f} | {1e3 * after:.3f}"
             print(f"{row} | {apart:.0e} |", flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -77,7 +77,7 @@ def run(folder: Path, tasks: Sequence[str], seeds: int) -> list[dict[str, Any]]:
     return [json.loads(line) for line in out.stdout.decode().splitlines() if line[:1] == "{"]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print a table and write all numbers."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("old", type=Path)
@@ -108,8 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ratios = {n: median(new, n) / median(old, n) for n in ("compile", "solves")}
         print(f"{task:26} new / old: compile {ratios['compile']:.3f}, solve {ratios['solves']:.3f}")
     print(f"written: {write_json(options.out, found)}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

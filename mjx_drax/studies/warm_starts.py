@@ -11,7 +11,6 @@ the share of chains that are optimal, of both.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -51,7 +50,7 @@ def line(name: str, change: str, cold: Solution, warm: Solution) -> str:
     return f"| {name} | {change} | " + " | ".join(cells) + " |"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Solve and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("tasks", nargs="*", default=DEFAULT)
@@ -65,8 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             cold = solve(other, chains=chains, seed=1)
             warm = solve(other, chains=chains, seed=1, guess=known)
             print(line(name, change, cold, warm), flush=True)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

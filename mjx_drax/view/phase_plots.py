@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.physics.dynamics import mujoco_model
@@ -25,10 +24,10 @@ from mjx_drax.view.geoms import Floats
 from mjx_drax.view.labels import coordinates, tangent_labels
 from mjx_drax.view.plotting import (
     BLUE,
-    DPI,
     PANELS,
     VERMILLION,
     label_panel,
+    new_figure,
     panel_figure,
     save_figure,
 )
@@ -104,8 +103,7 @@ def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
     values = np.nan_to_num(solution.multipliers.dynamics[solution.best_chain])
     times, names = solution.times, tangent_labels(solution.problem.dynamics)
     largest = np.abs(values).max(axis=0)
-    inches = (7.0, 0.24 * len(names) + 1.7)
-    figure = Figure(inches, DPI, layout="constrained", facecolor="white")
+    figure = new_figure(7.0, 0.24 * len(names) + 1.7)
     axes = figure.add_subplot()
     image = axes.imshow(
         (values / np.maximum(largest, 1e-30)).T,

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -145,7 +146,7 @@ def panel_figure(
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
     inches = (max(size[0] * columns, _LEAST_WIDTH), size[1] * rows + _TITLE_HEIGHT)
-    figure = Figure(inches, DPI, layout="constrained", facecolor="white")
+    figure = new_figure(*inches)
     grid = figure.add_gridspec(rows, columns)
     for i, panel in enumerate(panels):
         row, column = divmod(i, columns)
@@ -155,6 +156,11 @@ def panel_figure(
         names = figure.axes[0].get_legend_handles_labels()
         figure.legend(*names, loc="outside lower center", ncols=legend, fontsize=7, frameon=False)
     return figure
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size in inches."""
+    return Figure((width, height), DPI, layout="constrained", facecolor="white")
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
@@ -403,13 +409,28 @@ def _scale_costs(axes: Axes, costs: np.ndarray) -> None:
     low, high = float(costs.min()), float(costs.max())
     if 0.0 < 10.0 * low < high:
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_locator(NullLocator())
+        label_decades(axes.yaxis)
         return
     pad = max(0.06 * (high - low), 0.01 * abs(high), 1e-9)
     axes.set_ylim(low - pad, high + pad)
     axes.ticklabel_format(axis="y", useOffset=False)
+
+
+def label_decades(axis: Axis) -> None:
+    """Of a logarithmic axis 1, 2 and 5 of every decade, as plain numbers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_locator(NullLocator())
+
+
+def label_axes(axes: Axes, xlabel: str, ylabel: str = "") -> None:
+    """Labels, a grid, and no frame above and on the right."""
+    axes.set_xlabel(xlabel, fontsize=8)
+    axes.set_ylabel(ylabel, fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.grid(True, color="0.9", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def label_panel(
@@ -417,11 +438,7 @@ def label_panel(
 ) -> None:
     """What every panel has."""
     axes.set_title(title, loc="left", fontsize=9, fontweight="bold", parse_math=False)
-    axes.set_xlabel(xlabel, fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.grid(True, color="0.9", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    label_axes(axes, xlabel)
     if not handles:
         return
     legend = axes.legend(

@@ -15,15 +15,9 @@ from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.lbfgs import BFGS
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import (
-    Numbers,
-    new_figure,
-    reaching,
-    solve_row,
-    tell,
-)
+from mjx_drax.studies.reproduce.output import Numbers, reaching, solve_row, tell
 from mjx_drax.studies.reproduce.settings import NO_NOISE, with_budget
-from mjx_drax.view.plotting import BLACK, BLUE, GREEN, VERMILLION
+from mjx_drax.view.plotting import BLACK, BLUE, GREEN, VERMILLION, new_figure
 
 FULL = {"chains": 256}
 """Sizes with --full: those of the numbers in docs/paper.md."""

@@ -20,8 +20,8 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
-from mjx_drax.view.plotting import CURVES
+from mjx_drax.studies.reproduce.output import Numbers, tell
+from mjx_drax.view.plotting import CURVES, label_axes, new_figure
 
 
 def make(
@@ -52,18 +52,13 @@ def make(
         solver = replace(flow, penalty=Constant(mu), step_size=step)
         squares, state = violations(solver, problem, chains, stops)
         low, median, high = np.nanquantile(squares, (0.1, 0.5, 0.9), axis=1)
-        defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
-        upright = judge(problem, np.asarray(state.trajectory.u, float)).success
         rows.append(
             {
                 "mu": mu,
                 "step size": step,
                 "iterations": total,
                 "chains": chains,
-                "median |h|²": float(median[-1]),
-                "median max|h|": float(np.median(defect)),
-                "feasible": float(np.mean(defect < FEASIBLE)),
-                "rollout upright": float(np.mean(upright)),
+                **outcome(problem, state, squares[-1]),
                 "diverged": float(np.mean(~np.asarray(state.alive))),
             }
         )
@@ -104,6 +99,18 @@ def violations(
         state, _ = advance(solver, problem, state, int(begin), int(end))
         squares.append(np.asarray(_square(problem, state.trajectory)))
     return np.stack(squares), state
+
+
+def outcome(problem: Problem, state: State, squares: np.ndarray) -> Numbers:
+    """What a row says of the last knots, whose |h|^2 are `squares` (chains,)."""
+    defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
+    upright = judge(problem, np.asarray(state.trajectory.u, float)).success
+    return {
+        "median |h|²": float(np.nanmedian(squares)),
+        "median max|h|": float(np.median(defect)),
+        "feasible": float(np.mean(defect < FEASIBLE)),
+        "rollout upright": float(np.mean(upright)),
+    }
 
 
 @jax.jit

@@ -33,8 +33,8 @@ from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.solution.batch import solve_batch
 from mjx_drax.studies import random_states
 from mjx_drax.studies.measurements import judge
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
-from mjx_drax.view.plotting import BLUE, VERMILLION
+from mjx_drax.studies.reproduce.output import Numbers, tell
+from mjx_drax.view.plotting import BLUE, VERMILLION, label_axes, new_figure
 
 FULL = {"chains": 16_384, "grid": (6001, 1401)}
 """Sizes with --full."""

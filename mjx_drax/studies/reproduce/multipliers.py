@@ -17,12 +17,10 @@ from mjx_drax.method.metrics import Direction, Identity, Metric
 from mjx_drax.method.model import Model
 from mjx_drax.method.schedules import Constant
 from mjx_drax.problem.problem import Problem
-from mjx_drax.search.iterate import FEASIBLE, evaluate
-from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.convergence import stable_step, violations
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
-from mjx_drax.view.plotting import BLUE, VERMILLION
+from mjx_drax.studies.reproduce.convergence import outcome, stable_step, violations
+from mjx_drax.studies.reproduce.output import Numbers, tell
+from mjx_drax.view.plotting import BLUE, VERMILLION, label_axes, new_figure
 
 
 @register_dataclass
@@ -61,8 +59,6 @@ def make(
             step = stable_step(flow, mu)
             solver = replace(flow, penalty=Constant(mu), step_size=step, preconditioner=metric)
             squares, state = violations(solver, problem, chains, stops)
-            defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
-            upright = judge(problem, np.asarray(state.trajectory.u, float)).success
             rows.append(
                 {
                     "mu": mu,
@@ -70,10 +66,7 @@ def make(
                     "step size": step,
                     "iterations": int(flow.iterations),
                     "chains": chains,
-                    "median |h|²": float(np.median(squares[-1])),
-                    "median max|h|": float(np.median(defect)),
-                    "feasible": float(np.mean(defect < FEASIBLE)),
-                    "rollout upright": float(np.mean(upright)),
+                    **outcome(problem, state, squares[-1]),
                 }
             )
     figure = new_figure(5.4, 3.6)

@@ -23,15 +23,9 @@ from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import (
-    Numbers,
-    label_axes,
-    new_figure,
-    solve_row,
-    tell,
-)
+from mjx_drax.studies.reproduce.output import Numbers, solve_row, tell
 from mjx_drax.studies.reproduce.settings import budget_of, initial_knots, with_budget
-from mjx_drax.view.plotting import BLACK, CURVES, GRAY, SKY
+from mjx_drax.view.plotting import BLACK, CURVES, GRAY, SKY, label_axes, new_figure
 
 FULL = {"chains": 256}
 """Sizes with --full."""

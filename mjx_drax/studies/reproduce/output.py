@@ -8,11 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from mjx_drax.solution.solution import Solution
-from mjx_drax.view.plotting import DPI
 
 Numbers = dict[str, Any]
 
@@ -75,18 +72,3 @@ def _cell(name: str, value: Any) -> str:
     if name.split(": ")[-1] in SHARES or "max|h| <" in name:
         return f"{value:.1%}"
     return f"{value:.4g}" if isinstance(value, float) else f"{value}"
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches."""
-    return Figure((width, height), DPI, layout="constrained", facecolor="white")
-
-
-def label_axes(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Labels, a grid, and no frame above and on the right."""
-    axes.set_xlabel(xlabel, fontsize=8)
-    axes.set_ylabel(ylabel, fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.grid(True, color="0.9", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)

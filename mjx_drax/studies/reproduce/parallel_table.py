@@ -19,8 +19,8 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.studies.many_starts import solve_each
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
-from mjx_drax.view.plotting import BLUE, GRAY, VERMILLION
+from mjx_drax.studies.reproduce.output import Numbers, tell
+from mjx_drax.view.plotting import BLUE, GRAY, VERMILLION, label_axes, new_figure
 
 PUBLISHED = {64: 0.68, 256: 0.75, 1024: 1.04, 2048: 1.49, 4096: 2.12, 8192: 3.53, 16384: 7.95}
 """Times [s] that the paper gives for N pendulums, 20,000 iterations, on an RTX 4070."""

@@ -14,15 +14,8 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import (
-    Numbers,
-    label_axes,
-    new_figure,
-    reaching,
-    solve_row,
-    tell,
-)
-from mjx_drax.view.plotting import BLACK, BLUE, GRAY, GREEN, ORANGE
+from mjx_drax.studies.reproduce.output import Numbers, reaching, solve_row, tell
+from mjx_drax.view.plotting import BLACK, BLUE, GRAY, GREEN, ORANGE, label_axes, new_figure
 
 
 def make(chains: int = 64, iterations: int | None = None) -> tuple[Numbers, Figure]:

@@ -35,8 +35,8 @@ from mjx_drax.method.schedules import Constant, Geometric
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.output import Numbers, label_axes, new_figure, tell
-from mjx_drax.view.plotting import BLACK, CURVES
+from mjx_drax.studies.reproduce.output import Numbers, tell
+from mjx_drax.view.plotting import BLACK, CURVES, label_axes, new_figure
 
 DESCENT = Langevin(
     iterations=0,
