@@ -1,14 +1,4 @@
-"""Make a figure or table of the paper again: writes NAME.png and NAME.json.
-
-phase-portrait           figure 2: random knots become a swing-up
-convergence              figure 3: |h|^2 for several penalties
-bug-trap                 figure 4: gradient descent, quasi-Newton and diffusion
-parallel-table           table I: many pendulums at once
-multipliers              |h|^2 with and without multipliers
-theorem-2                mu*, stable steps, and the energy of the proof
-direct-against-shooting  pendulums from random states
-open-questions           metrics, annealing, sampled gradients
-"""
+"""Make a figure or table of the paper again: writes NAME.png and NAME.json."""
 
 from __future__ import annotations
 
@@ -16,6 +6,8 @@ import argparse
 
 from mjx_drax.cli.common import at_least_1, say
 from mjx_drax.studies import reproduce
+
+__doc__ += "\n\n" + "\n".join(f"{name:24} {shows}" for name, shows in reproduce.NAMES.items())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from mjx_drax.physics.dynamics import mujoco_model
@@ -38,11 +36,7 @@ def state_names(dynamics: Dynamics) -> list[str]:
     model = mujoco_model(dynamics)
     if model is None:
         return list(dynamics.x_names) or [f"x{i}" for i in range(dynamics.nx)]
-    return [
-        *_joint_names(model, "qpos", _POSITIONS),
-        *_joint_names(model, "qvel", _VELOCITIES),
-        *_activation_names(model),
-    ]
+    return _of_model(model, _POSITIONS)
 
 
 def _further_names(dynamics: Extended) -> list[str]:
@@ -69,11 +63,7 @@ def difference_names(dynamics: Dynamics) -> list[str]:
     model = mujoco_model(dynamics)
     if model is None:
         return [f"coordinate {i}" for i in range(dynamics.ndx)]
-    return [
-        *_joint_names(model, "qpos", _ROTATIONS),
-        *_joint_names(model, "qvel", _VELOCITIES),
-        *_activation_names(model),
-    ]
+    return _of_model(model, _ROTATIONS)
 
 
 def control_names(dynamics: Dynamics) -> list[str]:
@@ -86,17 +76,15 @@ def control_names(dynamics: Dynamics) -> list[str]:
     return [f"ctrl_{model.actuator(i).name or i}" for i in range(model.nu)]
 
 
-def _joint_names(
-    model: mujoco.MjModel, kind: str, parts: dict[int, tuple[str, ...]]
-) -> Iterator[str]:
-    for i in range(model.njnt):
-        name = f"{kind}_{model.joint(i).name or i}"
-        for part in parts.get(int(model.jnt_type[i]), ("",)):
-            yield f"{name}_{part}" if part else name
-
-
-def _activation_names(model: mujoco.MjModel) -> Iterator[str]:
+def _of_model(model: mujoco.MjModel, positions: dict[int, tuple[str, ...]]) -> list[str]:
+    """Names of positions, velocities and activations."""
+    found: list[str] = []
+    for kind, parts in (("qpos", positions), ("qvel", _VELOCITIES)):
+        for i in range(model.njnt):
+            name = f"{kind}_{model.joint(i).name or i}"
+            own = parts.get(int(model.jnt_type[i]), ("",))
+            found += [f"{name}_{part}" if part else name for part in own]
     for i in range(model.nu):
-        name, count = model.actuator(i).name or i, int(model.actuator_actnum[i])
-        for part in range(count):
-            yield f"act_{name}" if count == 1 else f"act_{name}_{part}"
+        name, count = f"act_{model.actuator(i).name or i}", int(model.actuator_actnum[i])
+        found += [name] if count == 1 else [f"{name}_{part}" for part in range(count)]
+    return found

@@ -134,7 +134,6 @@ def both_ways(
         plan: planned states x_0..x_K, (n, K + 1, nx).
         u: planned controls, (n, K, nu).
         gains: feedback, (n, K, nu, ndx).
-        tolerances: what is tolerated.
     """
     which = np.arange(family.count)
 
@@ -159,7 +158,6 @@ def judged(
         plan: planned states x_0..x_K, (n, K + 1, nx), and
         u: controls (n, K, nu), whose extent gives violations their scale.
         ran: replayed states and controls, of the same shapes.
-        tolerances: what is tolerated.
     """
     problem, (states, controls) = family.at(0), ran
     off = np.nan_to_num(problem.dynamics.host_difference(states, plan), nan=np.inf)

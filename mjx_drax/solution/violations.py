@@ -295,7 +295,6 @@ def measured(
         motion: states x_0..x_K (n, K + 1, nx) and controls (n, K, nu).
         off: x_K - plan, (n, ndx).
         extent: of the plans, from `extents`.
-        tolerances: what is tolerated.
     """
     dtype = family.problem.x_init.dtype
     with family.problem.arithmetic():
@@ -454,7 +453,6 @@ def by_entry(
         motion: states x_0..x_K (K + 1, nx) and controls (K, nu).
         off: x_K - plan, (ndx,).
         extent: of the plan, from `extents`, without its first axis.
-        tolerances: what is tolerated.
     """
     dtype = problem.x_init.dtype
     with problem.arithmetic():

@@ -110,8 +110,20 @@ class LBFGS(Metric):
         )
 
     def _inverse_times(self, memory: Any, gradient: Array) -> Array:
-        """M^{-1} times the gradient (n,)."""
-        return _inverse_times(memory, gradient)
+        """M^{-1} times the gradient (n,); without pairs a steepest-descent step of unit length."""
+        pairs = memory.curvature.shape[0]
+        q, weights = gradient, [jnp.zeros(())] * pairs
+        for i in reversed(range(pairs)):
+            weights[i] = memory.curvature[i] * jnp.dot(memory.s[i], q)
+            q = q - weights[i] * memory.y[i]
+        newest = memory.curvature[-1] * jnp.dot(memory.y[-1], memory.y[-1])
+        length = jnp.linalg.norm(gradient)
+        scale = jnp.where(newest > 0.0, newest, jnp.maximum(length, 1e-12))
+        q = q / scale
+        for i in range(pairs):
+            beta = memory.curvature[i] * jnp.dot(memory.y[i], q)
+            q = q + memory.s[i] * (weights[i] - beta)
+        return q
 
 
 @register_dataclass
@@ -157,20 +169,3 @@ class BFGS(LBFGS):
         """M^{-1} times the gradient; before the first pair a step of unit length."""
         length = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
         return jnp.where(memory.began, memory.inverse @ gradient, gradient / length)
-
-
-def _inverse_times(memory: Memory, gradient: Array) -> Array:
-    """M^{-1} times the gradient (n,); without pairs a steepest-descent step of unit length."""
-    pairs = memory.curvature.shape[0]
-    q, weights = gradient, [jnp.zeros(())] * pairs
-    for i in reversed(range(pairs)):
-        weights[i] = memory.curvature[i] * jnp.dot(memory.s[i], q)
-        q = q - weights[i] * memory.y[i]
-    newest = memory.curvature[-1] * jnp.dot(memory.y[-1], memory.y[-1])
-    length = jnp.linalg.norm(gradient)
-    scale = jnp.where(newest > 0.0, newest, jnp.maximum(length, 1e-12))
-    q = q / scale
-    for i in range(pairs):
-        beta = memory.curvature[i] * jnp.dot(memory.y[i], q)
-        q = q + memory.s[i] * (weights[i] - beta)
-    return q

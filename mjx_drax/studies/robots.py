@@ -24,14 +24,13 @@ from jax import Array
 from jax.tree_util import Partial
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.base.files import write_json
 from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjcf import from_mjcf
 from mjx_drax.physics.motors import Actuators, add_motors
 from mjx_drax.physics.source import load
 from mjx_drax.problem.problem import Problem
-from mjx_drax.studies.third_party import HEADER, Row, line, solved
+from mjx_drax.studies.third_party import Row, solved, told
 
 
 def double_cart_pole(path: Path) -> Problem:
@@ -255,19 +254,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         print(f"there is no task {', '.join(unknown)}: use {', '.join(TASKS)}.", file=sys.stderr)
         return 2
-    rows: list[Row] = []
-    print(HEADER, flush=True)
-    for name in options.names or TASKS:
-        row: Row = {"model": name}
+
+    def measured(name: str) -> Row:
         inside, make = TASKS[name]
         try:
-            row |= solved(make(model_file(inside, options.path)), options.chains, options.seed)
+            found = solved(make(model_file(inside, options.path)), options.chains, options.seed)
         except DraxError as error:
-            row |= {"refused": str(error)}
-        print(line(row), flush=True)
-        rows.append(row)
-        if options.out:
-            write_json(Path(options.out) / "robots.json", rows)
+            found = {"refused": str(error)}
+        return {"model": name, **found}
+
+    names = options.names or TASKS
+    rows = told(map(measured, names), options.out and Path(options.out) / "robots.json")
     return 0 if all(row.get("certified") for row in rows) else 1
 
 

@@ -18,7 +18,7 @@ import importlib.util
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,14 +86,7 @@ def complete_models(folder: Path, name: str) -> dict[str, Path]:
 
 
 def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
-    """Reach a posture with one model, as a row of the table.
-
-    Args:
-        name: in the table.
-        path: the model's file.
-        chains: number of chains.
-        seed: of the posture and of the solve.
-    """
+    """Reach a posture with one model, as a row of the table; `seed` is that of both."""
     from mjx_drax.kernels.compilation import keep_none
     from mjx_drax.modelling.postures import reach
     from mjx_drax.physics.source import load
@@ -191,6 +184,18 @@ def causes(rows: Sequence[Row]) -> str:
     return "\n".join(["| cause | models | such as |\n|---|---|---|", *lines])
 
 
+def told(measured: Iterable[Row], out: Path | None) -> list[Row]:
+    """Print the table row by row; write all rows after each, because a run takes long."""
+    rows = []
+    print(HEADER, flush=True)
+    for row in measured:
+        print(line(row), flush=True)
+        rows.append(row)
+        if out:
+            write_json(out, rows)
+    return rows
+
+
 def fine(row: Row) -> bool:
     """Whether the model was solved, or refused with a reason."""
     return bool(row.get("certified") or row.get("refused"))
@@ -219,14 +224,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         names = ", ".join(known) or 'none: pip install "mjx-drax[third-party]"'
         print(f"there is no model {', '.join(unknown)}: there is {names}.", file=sys.stderr)
         return 2
-    rows = []
-    print(HEADER, flush=True)
-    for name in options.names or known:
-        row = measure_apart(name, known[name], options.chains, options.seed, options.timeout)
-        print(line(row), flush=True)
-        rows.append(row)
-        if options.out:  # after every row, because a run takes long
-            write_json(Path(options.out) / "third_party.json", rows)
+    rest = options.chains, options.seed, options.timeout
+    measured = (measure_apart(name, known[name], *rest) for name in options.names or known)
+    rows = told(measured, options.out and Path(options.out) / "third_party.json")
     print(f"\n{causes(rows)}", flush=True)
     return 0 if all(map(fine, rows)) else 1
 

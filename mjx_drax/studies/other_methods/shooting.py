@@ -168,7 +168,9 @@ def advance(
             u=jnp.where(better, u[best], plan.u),
             cost=jnp.where(better, cost[best], plan.cost),
         )
-        mean, spread = method.update(plan, v, _finite(cost), (i + 1) / total)
+        finite = jnp.isfinite(cost)
+        cost = jnp.where(finite, cost, jnp.max(jnp.where(finite, cost, 0.0)))  # the largest
+        mean, spread = method.update(plan, v, cost, (i + 1) / total)
         return replace(plan, mean=mean, spread=spread)
 
     def step(i: Array, plans: Plan) -> Plan:
@@ -212,12 +214,6 @@ def _smoother(r: ArrayLike, K: int) -> Array:
     k = jnp.arange(K)
     powers = jnp.tril(jnp.asarray(r, float) ** jnp.maximum(k[:, None] - k, 0))
     return powers * jnp.where(k == 0, 1.0, jnp.sqrt(1.0 - jnp.square(r)))
-
-
-def _finite(cost: Array) -> Array:
-    """The costs, where one that is not finite becomes the largest of the others."""
-    finite = jnp.isfinite(cost)
-    return jnp.where(finite, cost, jnp.max(jnp.where(finite, cost, 0.0)))
 
 
 def _box(problem: Problem) -> tuple[Array, Array]:

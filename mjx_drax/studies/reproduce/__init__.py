@@ -1,14 +1,5 @@
 """The paper's figures and table, and answers to its open questions: one file each.
 
-    phase_portrait    the pendulum's knots before and after, and its bang-bang controls
-    convergence       |h|^2 over the iterations for several penalties mu
-    multipliers       |h|^2 with and without multipliers, over mu
-    theorem_2         mu*, where the flow is stable, and its energy, at the pendulum's optimum
-    bug_trap          gradient descent, quasi-Newton and diffusion side by side
-    direct_against_shooting  random states, beside what dynamic programming says is possible
-    parallel_table    N pendulums at once: time, and what the time bought
-    open_questions    preconditioning, annealing, noise or none, sampled or exact gradients
-
 Each has `make`, which returns numbers (`rows` of a table, `settings`, and more) and a figure; sizes
 are its arguments. `run` makes one by name and writes both. No number in these files is a result:
 there are settings, and the times that the paper published. A chain counts as feasible when
@@ -24,16 +15,17 @@ import os
 from importlib import import_module
 from typing import Any
 
-NAMES = (
-    "phase-portrait",
-    "convergence",
-    "multipliers",
-    "theorem-2",
-    "bug-trap",
-    "direct-against-shooting",
-    "parallel-table",
-    "open-questions",
-)
+NAMES = {
+    "phase-portrait": "figure 2: random knots become a swing-up",
+    "convergence": "figure 3: |h|^2 for several penalties",
+    "bug-trap": "figure 4: gradient descent, quasi-Newton and diffusion",
+    "parallel-table": "table I: many pendulums at once",
+    "multipliers": "|h|^2 with and without multipliers",
+    "theorem-2": "mu*, stable steps, and the energy of the proof",
+    "direct-against-shooting": "pendulums from random states",
+    "open-questions": "metrics, annealing, sampled gradients",
+}
+"""What each shows."""
 
 
 def run(

@@ -33,11 +33,7 @@ def make(
 
     The step is alpha = 0.025 as long as that is stable, and 0.25 / mu beyond mu = 10, because the
     largest eigenvalue of mu J'J grows with mu.
-
-    Args:
-        chains: of each penalty.
-        iterations: 20,000 by default.
-        penalties: values of mu.
+    There are `chains` of each penalty mu, and 20,000 iterations by default.
     """
     problem = tasks.load("pendulum").make()
     flow = settings.pendulum_flows(iterations)["paper's flow"]

@@ -150,9 +150,7 @@ def _shoot(problem: Problem, starts: Array, key: Array, iterations: int) -> Arra
         states = jnp.zeros((K + 1, problem.dynamics.nx))
         first = rollout(own, 0.99 * u, *zero, states, jnp.zeros(()))
 
-        def improve(
-            carried: tuple[Trajectory, Array], t: Array
-        ) -> tuple[tuple[Trajectory, Array], None]:
+        def improve(carried: Carried, t: Array) -> tuple[Carried, None]:
             knots, delta = carried
             rho = BARRIER[0] * (BARRIER[1] / BARRIER[0]) ** t
             weights = Weights(jnp.zeros(()), jnp.full((), 1e5), delta, rho)

@@ -41,12 +41,9 @@ def make(
     iterations: int | None = None,
     penalties: Sequence[float] = (1.0, 10.0, 100.0),
 ) -> tuple[Numbers, Figure]:
-    """The median of the chains at the end, for every penalty, with multipliers and without.
+    """The median of the chains at the end, for every penalty mu, with multipliers and without.
 
-    Args:
-        chains: of each penalty.
-        iterations: 20,000 by default.
-        penalties: values of mu.
+    There are `chains` of each, and 20,000 iterations by default.
     """
     problem = tasks.load("pendulum").make()
     flow = settings.pendulum_flows(iterations)["paper's flow"]

@@ -21,9 +21,8 @@ from mjx_drax.view.plotting import BLACK, BLUE, GRAY, GREEN, ORANGE, label_axes,
 def make(chains: int = 64, iterations: int | None = None) -> tuple[Numbers, Figure]:
     """Left the paper's flow, right the preconditioned one, from the same random knots.
 
-    Args:
-        chains: number of chains; the first is drawn, whatever became of it.
-        iterations: of the paper's flow; 20,000 by default.
+    The first chain is drawn, whatever became of it. `iterations` of the paper's flow are 20,000 by
+    default.
     """
     problem, solvers = tasks.load("pendulum").make(), settings.pendulum_flows(iterations)
     start = settings.initial_knots(problem, chains)
