@@ -1,4 +1,7 @@
-"""The exception that users see, the warning, and the words that many of their messages share."""
+"""The exception that users see, the warning, and the words that many of their messages share.
+
+To complain is to raise a DraxError that names what it is about, its value and the fix.
+"""
 
 from __future__ import annotations
 
@@ -46,41 +49,25 @@ def is_number(value: object) -> bool:
 
 
 def require_whole(name: str, value: object, least: int = 1) -> None:
-    """Complain about what is not a whole number of at least so much.
-
-    Raises:
-        DraxError: naming it, its value and the fix.
-    """
+    """Complain about what is not a whole number of at least so much."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise DraxError(f"{name} is {shown(value)}: give a whole number of at least {least}.")
 
 
 def require_positive(name: str, value: object, what: str = "a positive number") -> None:
-    """Complain about what is not a positive, finite number.
-
-    Raises:
-        DraxError: naming it, its value and the fix.
-    """
+    """Complain about what is not a positive, finite number."""
     if not is_number(value) or value <= 0:  # type: ignore[operator]
         raise DraxError(f"{name} is {shown(value)}: give {what}.")
 
 
 def require_not_negative(name: str, value: object) -> None:
-    """Complain about what is not a finite number of at least 0.
-
-    Raises:
-        DraxError: naming it, its value and the fix.
-    """
+    """Complain about what is not a finite number of at least 0."""
     if not is_number(value) or value < 0:  # type: ignore[operator]
         raise DraxError(f"{name} is {shown(value)}: give a number of at least 0.")
 
 
 def require_part(name: str, value: object, method: str, example: str) -> None:
-    """Complain about what is no object with such a method, as parts of a solver are.
-
-    Raises:
-        DraxError: naming it, its value and the fix.
-    """
+    """Complain about what is no object with such a method, as parts of a solver are."""
     if isinstance(value, type):
         raise DraxError(f"{name} is a class: give an object, {value.__name__}().")
     if not callable(getattr(value, method, None)):

@@ -20,11 +20,7 @@ from mjx_drax.base.errors import DraxError, shown
 
 
 def file_path(path: object) -> Path:
-    """The path of a file or folder, `~` being the user's home.
-
-    Raises:
-        DraxError: it is no path.
-    """
+    """The path of a file or folder, if it is one, `~` being the user's home."""
     try:
         target = Path(path).expanduser()  # type: ignore[arg-type]
         os.fsencode(target)
@@ -150,11 +146,7 @@ def require_room(path: str | os.PathLike[str], size: int = 1) -> None:
 
 
 def require(package: str, extra: str, purpose: str) -> None:
-    """Complain about an optional package that is not installed; call it before a long computation.
-
-    Raises:
-        DraxError: naming the command that installs it.
-    """
+    """Complain about an optional package that is missing; call it before a long computation."""
     if importlib.util.find_spec(package) is None:
         raise DraxError(
             f'{purpose} needs {package}, which is not installed: pip install "mjx-drax[{extra}]".'

@@ -19,11 +19,7 @@ WIDTH = 0.01
 
 
 def require_plannable(problem: Problem) -> None:
-    """Complain about what cannot be left open while a robot runs.
-
-    Raises:
-        DraxError: saying why, and what to give instead.
-    """
+    """Complain about what cannot be left open while a robot runs."""
     name, dynamics = problem.name, problem.dynamics
     own = dynamics if isinstance(dynamics, Extended) else None
     if own.free if own is not None else problem.free:

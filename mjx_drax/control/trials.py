@@ -116,11 +116,7 @@ class Trials:
     motions: list[Motion] = field(default_factory=list)
 
     def check(self, count: int, pushes: int) -> tuple[float, float]:
-        """Between which times pushes come [s]; call it before the policy is reset.
-
-        Raises:
-            DraxError: numbers that make no sense, or runs that leave no time for pushes.
-        """
+        """When pushes begin and end [s], if runs leave time for them; call it before `reset`."""
         require_whole("runs", count)
         require_whole("pushes", pushes, 0)
         require_positive("duration", self.duration, "a positive number of seconds")

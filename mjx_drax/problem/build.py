@@ -26,11 +26,7 @@ MOST = 1_000_000
 
 
 def knots_in(horizon: Any, dt: float) -> int:
-    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
-
-    Raises:
-        DraxError: dt or the horizon is not a positive number, or the horizon is shorter than dt.
-    """
+    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s]."""
     for label, value in (("dt", dt), ("horizon", horizon)):
         require_positive(label, value, "a positive number of seconds")
     share = float(horizon) / float(dt)
@@ -47,11 +43,7 @@ def knots_in(horizon: Any, dt: float) -> int:
 
 
 def steps(horizon: Any, dt: float | None, count: Any) -> tuple[int, float]:
-    """K and dt of a fixed horizon [s], from one of them.
-
-    Raises:
-        DraxError: both or neither are given, or what is given makes no sense.
-    """
+    """K and dt of a fixed horizon [s], from the one of them that must be given."""
     if (dt is None) == (count is None):
         raise DraxError(f"dt is {dt} and knots is {count}: give one of the two.")
     if dt is not None:
@@ -322,11 +314,7 @@ def _names(label: str, names: Sequence[str], count: int) -> tuple[str, ...]:
 
 
 def require_name(name: object) -> None:
-    """Complain about a name that is no text.
-
-    Raises:
-        DraxError: naming its value.
-    """
+    """Complain about a name that is no text."""
     if not isinstance(name, str) or not name:
         raise DraxError(f"name is {shown(name)}: give a text.")
 

@@ -65,11 +65,7 @@ class Parts(NamedTuple):
 
 
 def phases_of(horizon: Any, knots: Any) -> tuple[tuple[float, float, int], ...]:
-    """The phases of free duration; () where the horizon is one number.
-
-    Raises:
-        DraxError: durations or numbers of knots that make no sense.
-    """
+    """The phases of free duration; () where the horizon is one number."""
     if is_number(horizon):
         return ()
     one = isinstance(horizon, tuple) and len(horizon) == 2 and all(map(is_number, horizon))
@@ -103,11 +99,7 @@ def extend(
     bounds: Box,
     scatter: Box,
 ) -> Parts:
-    """The parts of the problem with all that is left open in it.
-
-    Raises:
-        DraxError: choices that do not fit.
-    """
+    """The parts of the problem with all that is left open in it, if the choices fit."""
     places, lower, upper = _start(choices, dynamics, x_init)
     asked = any(takes_knot(f) for f in given.values() if f is not None)
     steps = np.array([[a / k, b / k] for a, b, k in choices.phases]).reshape(-1, 2)
@@ -227,11 +219,7 @@ def _start(
 def parameter_ends(
     given: Mapping[str, Pair] | None,
 ) -> tuple[tuple[tuple[str, tuple[int, ...]], ...], np.ndarray, np.ndarray]:
-    """Names and shapes of the parameters, and their lower and upper ends in one vector.
-
-    Raises:
-        DraxError: ends that are no finite numbers, or that cross.
-    """
+    """Names and shapes of the parameters, and their finite lower and upper ends in one vector."""
     shapes, low, high = [], [np.zeros(0)], [np.zeros(0)]
     if given is not None and not isinstance(given, Mapping):
         raise DraxError(f"parameters are {shown(given)}: give {{name: (lower, upper)}}.")

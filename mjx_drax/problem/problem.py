@@ -471,11 +471,7 @@ class Problem:
 
 
 def checked(problem: Problem) -> Problem:
-    """The problem, if sizes, bounds and functions fit together; traced abstractly, not compiled.
-
-    Raises:
-        DraxError: naming the cause, the value seen and the fix.
-    """
+    """The problem, if sizes, bounds and functions fit together; traced abstractly, not compiled."""
     if not isinstance(problem, Problem):
         raise DraxError(
             f"the problem is {shown(problem)}: give one from from_mjcf or from_function."

@@ -26,11 +26,7 @@ Arguments = tuple[Any, ...]
 
 
 def require_functions(**given: Any) -> None:
-    """Complain about what is neither a function nor None.
-
-    Raises:
-        DraxError: naming it, its value and the fix.
-    """
+    """Complain about what is neither a function nor None."""
     for label, function in given.items():
         if function is not None and (not callable(function) or isinstance(function, type)):
             raise DraxError(f"{label} is {shown(function)}: give a function, or leave it out.")
@@ -39,11 +35,7 @@ def require_functions(**given: Any) -> None:
 def require_shape(
     label: str, function: Callable[..., Any], arguments: Arguments, shape: tuple[int, ...] | None
 ) -> None:
-    """Trace a function abstractly; complain if it fails or returns another shape.
-
-    Raises:
-        DraxError: naming the cause, what was returned and the fix.
-    """
+    """Trace a function abstractly; complain if it fails or returns another shape."""
     seen = traced(label, function, arguments).shape
     if shape is not None and seen != shape:
         expected = "a scalar" if shape == () else f"shape {shape}"

@@ -162,11 +162,7 @@ def _solution(
 
 
 def _require_consistent(solution: Results, summary: dict[str, Any]) -> None:
-    """Complain about arrays that do not fit each other, and numbers of the wrong kind.
-
-    Raises:
-        DraxError: naming the first that does not fit.
-    """
+    """Complain about arrays that do not fit each other, and numbers of the wrong kind."""
     x, u = solution.trajectories.x, solution.trajectories.u
     dynamics = solution.problem.dynamics
     chains, K, nx, nu = *x.shape, u.shape[-1]
@@ -357,11 +353,7 @@ def _model(summary: dict[str, Any], arrays: Arrays) -> tuple[mujoco.MjModel, Sou
 
 
 def _file_name(name: str) -> str:
-    """The name of a model's file, if it names a file in whatever folder it is written to.
-
-    Raises:
-        DraxError: it leads to another folder, as an archive that someone has tampered with may.
-    """
+    """The name of a model's file, if it leads to no other folder, as after somebody's tampering."""
     drive = len(name) > 1 and name[0].isalpha() and name[1] == ":"
     if drive or name in ("", ".", "..") or any(mark in name for mark in "/\\\0"):
         raise DraxError(

@@ -233,11 +233,7 @@ class Results:
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
 
     def chain_or_best(self, chain: int | None) -> int:
-        """The chain's number, and the best one's for None.
-
-        Raises:
-            DraxError: there is no such chain.
-        """
+        """The chain's number, if there is such a chain; the best one's for None."""
         if chain is None:
             return self.best_chain
         require_whole("chain", chain, 0)

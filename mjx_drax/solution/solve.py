@@ -119,11 +119,7 @@ def solve(
 
 
 def warm_of(solution: Solution, problem: Problem, chains: int) -> Warm:
-    """The solution's chains for another solve, the best first; as often as there are places.
-
-    Raises:
-        DraxError: the problem has other sizes.
-    """
+    """The solution's chains for a solve of the same sizes, the best first, resized to `chains`."""
     order = np.lexsort(ranking(solution.cost, solution.max_defect)[::-1])
     dtype, gains = problem.x_init.dtype, jnp.asarray(solution.gains)
     known = Warm(solution.trajectories, solution.multipliers, gains)

@@ -130,11 +130,7 @@ class Tolerances:
 
 
 def as_tolerances(given: Tolerances | None) -> Tolerances:
-    """The tolerances, the default ones for None.
-
-    Raises:
-        DraxError: they are something else.
-    """
+    """The tolerances, if they are such; the default ones for None."""
     if given is None:
         return Tolerances()
     if not isinstance(given, Tolerances):

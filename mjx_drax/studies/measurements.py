@@ -250,11 +250,7 @@ def seconds_to_replay(problem: Problem, u: np.ndarray) -> float:
 
 
 def ipopt(problem: Problem, starts: int, seed: int, program: Transcription | None = None) -> Row:
-    """IPOPT from random knots, one start after the other on one thread.
-
-    Raises:
-        DraxError: casadi is not installed, or the problem is not written for it.
-    """
+    """IPOPT from random knots, one start after the other on one thread; see `Transcription`."""
     clock = time.perf_counter()
     program = program or Transcription(problem)
     building = time.perf_counter() - clock

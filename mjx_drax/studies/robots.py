@@ -220,11 +220,7 @@ TASKS: dict[str, tuple[str, Callable[[Path], Problem]]] = {
 
 
 def model_file(inside: str, folder: Path | None = None) -> Path:
-    """Where a file of a package is: below a folder, or where the package is installed.
-
-    Raises:
-        DraxError: it is not there.
-    """
+    """Where a file of a package is: below a folder, or where the package is installed."""
     package, rest = inside.split("/", 1)
     if folder is None:
         spec = importlib.util.find_spec(package)

@@ -104,11 +104,7 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
 
 
 def solved(problem: Problem, chains: int, seed: int) -> Row:
-    """Solve the problem of a model with default settings: what the columns of the table show.
-
-    Raises:
-        DraxError: it cannot be solved.
-    """
+    """Solve the problem of a model with default settings: what the columns of the table show."""
     from mjx_drax.physics.dynamics import MjxDynamics
     from mjx_drax.physics.mjx_model import constraint_rows
     from mjx_drax.solution.solve import solve

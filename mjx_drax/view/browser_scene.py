@@ -43,11 +43,7 @@ _FLOOR = 20.0  # half side of a floor without end, in extents of the model
 
 
 def require_viewer(problem: Problem) -> None:
-    """Complain about what a browser could not show; call it before a long computation.
-
-    Raises:
-        DraxError: viser is missing, or the problem has no model.
-    """
+    """Complain where viser is missing, or a model to show; call it before a long computation."""
     if mujoco_model(problem.dynamics) is None:
         raise DraxError(
             f"{problem.name} has no MuJoCo model to show in a browser, its dynamics are a "
@@ -58,11 +54,7 @@ def require_viewer(problem: Problem) -> None:
 
 @contextlib.contextmanager
 def server_at(port: int = 0) -> Iterator[viser.ViserServer]:
-    """viser's server on a port of this machine, 0 for any; what it prints is dropped.
-
-    Raises:
-        DraxError: the port cannot be opened.
-    """
+    """viser's server on a free port of this machine, 0 for any; what it prints is dropped."""
     import viser
 
     with contextlib.redirect_stdout(io.StringIO()):

@@ -86,13 +86,10 @@ def render_diffusion(
       ghosts: number of knots at which the robot is shown; by default 24, or fewer if it has many
         parts, which take long to draw without a GPU.
       chains: number of chains whose paths are shown, those of distinct optima first.
-      fps: frames per second.
-      size: (width, height) [pixels].
+      fps, size, speed, caption: as in `render`.
       camera: a camera of the model, see `motion_frames`; None sees all that is shown.
-      speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes, one line of
         it with a vertex for each state; needed for problems without a model.
-      caption: whether there is a strip with text.
 
     Raises:
       DraxError: nothing was recorded, a setting that cannot be used, or neither model nor `draw`.

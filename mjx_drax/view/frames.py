@@ -56,11 +56,7 @@ def write(path: str | os.PathLike[str], frames: Generator[Frame, None, None], fp
 
 
 def video_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a video; call it before a long computation.
-
-    Raises:
-      DraxError: its name ends in none of `SUFFIXES`.
-    """
+    """The path of a video, which must have one of `SUFFIXES`; call it before a long computation."""
     target = file_path(path)
     if target.suffix.lower() not in SUFFIXES:
         raise DraxError(f"{target.name!r} does not end in {' or '.join(SUFFIXES)}: rename it.")
@@ -110,11 +106,7 @@ def _with_palette(images: list[Image.Image]) -> list[Image.Image]:
 
 
 def even_size(size: tuple[int, int]) -> tuple[int, int]:
-    """(width, height), both rounded up to even numbers, as H.264 needs them.
-
-    Raises:
-      DraxError: they are not two whole numbers within 16 and 8192.
-    """
+    """(width, height), within 16 and 8192, rounded up to even numbers, as H.264 needs them."""
     try:
         width, height = (int(side) for side in size)
     except (TypeError, ValueError, OverflowError):

@@ -141,11 +141,7 @@ def check(
     speed: float = 1.0,
     draw: Draw | None = None,
 ) -> None:
-    """Complain before a solve about what `render` would refuse after it.
-
-    Raises:
-      DraxError: a size, fps, speed or camera that cannot be used, or neither a model nor `draw`.
-    """
+    """Complain before a solve about what `render` would refuse after it, such as a wrong camera."""
     frame_times(np.zeros(1), fps, speed)
     even_size(size)
     model = mujoco_model(problem.dynamics)

@@ -78,11 +78,7 @@ def names() -> tuple[str, ...]:
 
 
 def posed(name: str) -> tuple[Problem, Trajectory]:
-    """A problem of the suite and its guess, x (K, nx) and u (K, nu).
-
-    Raises:
-        DraxError: there is no such problem.
-    """
+    """A problem of the suite and its guess, x (K, nx) and u (K, nu)."""
     if name in CASES:
         problem = replace(CASES[name].make(), name=name)
         return problem, CASES[name].guess(problem)

@@ -36,10 +36,6 @@ class CEM:
     correlation: ArrayLike = 0.0
     elite: int = field(default=26, metadata=Static)
 
-    def first_spread(self) -> ArrayLike:
-        """s."""
-        return self.spread
-
     def update(self, plan: Plan, v: Array, cost: Array, t: Array) -> tuple[Array, Array]:
         """Mean and spread nearer to those of the elite."""
         _, chosen = jax.lax.top_k(-cost, min(self.elite, len(cost)))

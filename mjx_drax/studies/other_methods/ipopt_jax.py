@@ -46,11 +46,7 @@ class Answer:
 
 
 def solve(problem: Problem, guess: Trajectory) -> Answer:
-    """IPOPT from initial knots, x (K, nx) and u (K, nu).
-
-    Raises:
-        DraxError: casadi is not installed.
-    """
+    """IPOPT, if casadi is installed, from initial knots, x (K, nx) and u (K, nu)."""
     require_casadi()
     import casadi
 

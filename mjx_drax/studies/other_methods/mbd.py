@@ -40,7 +40,8 @@ class MBD:
     temperature: ArrayLike = 0.1
     correlation: ArrayLike = 0.0
 
-    def first_spread(self) -> ArrayLike:
+    @property
+    def spread(self) -> ArrayLike:
         """s at i = T."""
         return _spread(1.0)
 

@@ -29,10 +29,6 @@ class MPPI:
     spread: ArrayLike = 0.5
     correlation: ArrayLike = 0.0
 
-    def first_spread(self) -> ArrayLike:
-        """s."""
-        return self.spread
-
     def update(self, plan: Plan, v: Array, cost: Array, t: Array) -> tuple[Array, Array]:
         """The weighted mean; the spread stays."""
         return average(v, cost, self.temperature), plan.spread

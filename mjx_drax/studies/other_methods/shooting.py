@@ -64,7 +64,8 @@ class Method(Protocol):
     def correlation(self) -> ArrayLike:
         """r, in [0, 1)."""
 
-    def first_spread(self) -> ArrayLike:
+    @property
+    def spread(self) -> ArrayLike:
         """s of the first iteration, scalar."""
 
     def update(self, plan: Plan, v: Array, cost: Array, t: Array) -> tuple[Array, Array]:
@@ -116,7 +117,7 @@ def optimize(
     total = max(round(evaluations / (runs * samples * K)), 1)
     keys = jax.random.split(jax.random.key(seed), runs)
     zeros = jnp.zeros((runs, K, nu))
-    spread = jnp.full_like(zeros, method.first_spread())
+    spread = jnp.full_like(zeros, method.spread)
     plans = Plan(zeros, spread, zeros, jnp.full(runs, jnp.inf))
 
     clock = time.perf_counter()

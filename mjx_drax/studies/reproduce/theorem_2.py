@@ -218,21 +218,12 @@ class _Functions:
 
     def slack(self, z: np.ndarray, step: np.ndarray) -> float:
         """The largest share of a step that uses up at most 0.9 of every slack."""
-        box = self._problem.bounds
-        x, dx = (self._knots(jnp.asarray(a)) for a in (z, step))
-        shares = [1.0]
-        for value, change, ends in zip(
-            jax.tree.leaves(x),
-            jax.tree.leaves(dx),
-            zip(*map(jax.tree.leaves, box.sides(x)), strict=True),
-            strict=True,
-        ):
-            for end in ends:
-                toward = (np.asarray(end) - value) * np.sign(change)
-                moves = np.isfinite(end) & (change != 0) & (toward > 0)
-                share = 0.9 * np.where(moves, toward / np.where(moves, np.abs(change), 1.0), np.inf)
-                shares.append(float(np.min(share)))
-        return min(shares)
+        share = 1.0
+        for end in map(self.flat, self._problem.bounds.sides(self._knots(jnp.asarray(z)))):
+            toward = (end - z) * np.sign(step)
+            moves = np.isfinite(end) & (toward > 0)
+            share = np.min(0.9 * toward[moves] / np.abs(step[moves]), initial=share)
+        return float(share)
 
 
 def _optimum(functions: _Functions, problem: Problem, rho: float) -> Optimum:
