@@ -63,14 +63,9 @@ def complete(path: str | os.PathLike[str], suffixes: tuple[str, ...] = ()) -> It
 
 
 def write_json(path: str | os.PathLike[str], data: Any) -> Path:
-    """Write nested dicts, lists, numbers and texts as JSON; returns the path.
+    """Write nested dicts, lists, numbers and texts as JSON; returns the path, which ends in .json.
 
-    Args:
-        path: of the file, ending in .json.
-        data: may hold NumPy and JAX arrays; a number that is not finite becomes null.
-
-    Raises:
-        DraxError: the file cannot be written.
+    There may be NumPy and JAX arrays; a number that is not finite becomes null.
     """
     text = json.dumps(json_data(data), indent=2, ensure_ascii=False, allow_nan=False)
     with complete(path, (".json",)) as partial:

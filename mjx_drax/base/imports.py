@@ -12,11 +12,7 @@ from mjx_drax.base.errors import DraxError, reason, shown
 
 
 def imported(text: str) -> Any:
-    """What MODULE:CLASS names, of a module that is installed or lies in the current folder.
-
-    Raises:
-        DraxError: the module cannot be imported, or has no such name.
-    """
+    """What MODULE:CLASS names, of a module that is installed or lies in the current folder."""
     module, _, name = text.partition(":")
     here = os.getcwd()
     sys.path.append(here)

@@ -144,11 +144,9 @@ def random_pushes(
     """Pushes on random moving bodies, along the world's x axis to either side.
 
     Args:
-        problem: from `from_mjcf`.
-        count: how many.
+        problem, count, seed: of how many pushes on the model of which problem.
         size: momentum of each, as a velocity [m/s] of the body it acts on.
         over: between which times [s]; one falls into each of `count` equal parts.
-        seed: of bodies, sides and times.
     """
     model = problem.dynamics.mj_model  # type: ignore[attr-defined]
     random = np.random.default_rng(seed)

@@ -61,18 +61,14 @@ def simulate(
     realtime: bool = False,
     pushes: Sequence[Push] = (),
 ) -> Motion:
-    """Drive the plant for so many seconds.
+    """Drive the plant for so many seconds, more than 0.
 
     Args:
         policy: that has been reset, or rewound, to the plant's time.
-        plant: where it starts.
-        duration: [s].
+        plant, duration: from where it starts, for how long [s].
         realtime: the plant runs by the clock on the wall while a thread plans; else it waits for
             each plan.
         pushes: the plant's, to be reported.
-
-    Raises:
-        DraxError: the duration is not a positive number.
     """
     require_positive("duration", duration, "a positive number of seconds")
     if realtime:
@@ -139,11 +135,8 @@ class Trials:
     ) -> Trials:
         """`count` runs from the problem's x_init, with so many pushes of a size [m/s] in each.
 
-        Pushes fall between the end of the first horizon and `SETTLE` before the end. `plant` holds
-        arguments of `Plant`; run i has the seed `seed` + i.
-
-        Raises:
-            DraxError: the runs leave no time for pushes.
+        Pushes fall between the end of the first horizon and `SETTLE` before the end; see `check`.
+        `plant` holds arguments of `Plant`; run i has the seed `seed` + i.
         """
         problem = self.policy.problem
         begin, end = self.check(count, pushes)

@@ -87,14 +87,9 @@ def keep_none() -> None:
 
 @contextmanager
 def said_plainly(what: str, hint: str = "with fewer chains") -> Iterator[None]:
-    """What JAX and its compiler raise, as a sentence.
+    """What JAX and its compiler raise about `what` is compiled and run, as a DraxError.
 
-    Args:
-        what: is compiled and run.
-        hint: what to try where memory is short.
-
-    Raises:
-        DraxError: with the first line of what they said, and what to try.
+    It has the first line of what they said, and what to try: the hint is for want of memory.
     """
     try:
         yield

@@ -82,7 +82,6 @@ def iterated(
     """The minimum (nv,), and what the last iteration left of its Hessian there.
 
     Args:
-        given: the function.
         product: of two matrices.
         newton: newton(H, g) -> H^{-1} g, and what is left of H.
         left: an array like what is left, or None.

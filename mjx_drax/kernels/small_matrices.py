@@ -69,7 +69,6 @@ def cholesky(
         A: (n, n), positive definite.
         root: the diagonal entry to keep, of its square.
         divide: a number by a diagonal entry as `root` keeps it.
-        minus_dot: how sums are taken.
     """
     L: list[Vector] = []
     for i in range(len(A)):

@@ -237,11 +237,9 @@ def assembled(
     """A problem from its parts, checked.
 
     Args:
-        dynamics: f.
+        dynamics, x_init: f and x_0, (nx,).
         given: the user's costs, residuals and constraints, by the names of `from_function`.
-        x_init: x_0, (nx,).
-        bounds: of states and controls.
-        scatter: box for initial knots.
+        bounds, scatter: of knots, and of initial ones.
         horizon: K.
         near: share of chains that start nearer to x_init.
         data: for each knot, as a user gives it.

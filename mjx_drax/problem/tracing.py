@@ -139,16 +139,8 @@ def require_derivatives(
 ) -> None:
     """Complain about a function that has no derivatives, or none but zeros.
 
-    Args:
-        label: of the function.
-        function: of pytrees of arrays, which `traced` accepts.
-        arguments: their shapes and dtypes.
-        forward: whether it is differentiated in forward mode,
-        twice: and twice so;
-        reverse: whether in reverse mode.
-
-    Raises:
-        DraxError: naming the function and the fix.
+    It is a function of pytrees of arrays, which `traced` accepts. It is differentiated in forward
+    mode, if asked for `twice` so, and in reverse mode.
     """
     leaves, tree = jax.tree.flatten(arguments)
     moves = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]

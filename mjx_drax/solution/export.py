@@ -52,11 +52,7 @@ class Exporter:
 
 
 def exporters() -> dict[str, Exporter]:
-    """One exporter of each named subclass of `Exporter` in the modules imported so far, by name.
-
-    Raises:
-        DraxError: a class that cannot be used.
-    """
+    """One exporter of each named subclass of `Exporter` in the modules imported so far, by name."""
     classes = Exporter.__subclasses__()
     for each in classes:  # the list grows: subclasses of subclasses too
         classes += each.__subclasses__()

@@ -62,11 +62,7 @@ def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
 
 
 def mjcf_of(problem: Problem) -> tuple[mujoco.MjModel, Source]:
-    """A problem's model, and its MJCF with the files that it needs.
-
-    Raises:
-        DraxError: the problem has no model, or its MJCF is not known or has changed.
-    """
+    """A problem's model, and its MJCF with the files that it needs; complains if there is none."""
     dynamics = mjx_dynamics(problem.dynamics)
     if dynamics is None:
         raise DraxError(

@@ -34,16 +34,12 @@ def residuals(history: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def table(history: dict[str, np.ndarray], tolerance: float) -> str:
-    """A line for each report.
+    """A line for each report in a `Results.history`.
 
     The best chain is the cheapest feasible one, or the least infeasible. Medians are over chains
     whose number is finite. Feasible and optimal are numbers of plans, before any replay: max|h|
     below 1e-3, and the residual below the tolerance too. Later attempts are of chains that were
-    not done; see `Results.history`.
-
-    Args:
-        history: as in `Results`.
-        tolerance: below which a residual is that of an optimum.
+    not done.
     """
     lines = list(HEADERS)
     rows = zip(

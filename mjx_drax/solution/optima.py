@@ -56,7 +56,6 @@ def cluster(
     """Which optimum each motion belongs to, (n,): 0, 1, ... in order of appearance, -1 for none.
 
     Args:
-        dynamics: whose `difference` compares states.
         states: x_1..x_K of every motion, cheapest first, (n, K, nx).
         tolerance: distance d within which motions are the same.
         still: least standard deviation s of a coordinate; what moves by less does not tell motions

@@ -31,9 +31,6 @@ def reporting(
         progress: a function of the user's; True or False: with a `Bar` or without; None: with one
             where somebody watches.
         name: what the bar calls the problem.
-
-    Raises:
-        DraxError: progress is something else.
     """
     if progress is None:
         progress = watched()

@@ -130,7 +130,6 @@ def both_ways(
     """Replays of plans, open loop and with feedback: one of each problem, or all of one.
 
     Args:
-        family: the problems.
         plan: planned states x_0..x_K, (n, K + 1, nx).
         u: planned controls, (n, K, nu).
         gains: feedback, (n, K, nu, ndx).
@@ -213,7 +212,6 @@ def defects(problem: Problem, plan: np.ndarray, u: np.ndarray) -> np.ndarray:
     """|f(x_k, u_k) - x_{k+1}| of one plan, (K, ndx): each knot's step, from its own state.
 
     Args:
-        problem: for its engine.
         plan: x_0..x_K, (K + 1, nx).
         u: controls, (K, nu).
 

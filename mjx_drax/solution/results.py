@@ -394,7 +394,6 @@ def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, 
     """The distinct optima that the chains found, cheapest first; none if no chain is certified.
 
     Args:
-        solution: from `solve`.
         tolerance: distance d within which motions are the same, in standard deviations of the
             states; a smaller one tells more of them apart.
 

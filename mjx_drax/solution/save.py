@@ -233,11 +233,7 @@ def json_digest(summary: dict[str, Any]) -> str:
 
 
 def writable(folder: str | os.PathLike[str], size: int = 1) -> Path:
-    """The folder, made if need be, with room for `size` bytes; call it before a long computation.
-
-    Raises:
-        DraxError: it cannot be made or written to, or the disk is too full.
-    """
+    """The folder, made if need be, with room for `size` bytes; call it before long computations."""
     path = file_path(folder)
     try:
         require_room(path / ARRAYS, size)

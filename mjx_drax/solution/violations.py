@@ -262,10 +262,7 @@ class Violations:
 def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:
     """Range over the knots of planned states (n, nx), their differences (n, ndx), controls (n, nu).
 
-    Args:
-        problem: for its state arithmetic; numbers of its own do not count.
-        plan: x_0..x_K, (n, K + 1, nx).
-        u: controls, (n, K, nu).
+    The plan is x_0..x_K, (n, K + 1, nx), with controls (n, K, nu).
     """
     moved = problem.dynamics.host_difference(plan, np.broadcast_to(plan[:, :1], plan.shape))
     with np.errstate(invalid="ignore"):  # of plans that are not finite
@@ -287,7 +284,6 @@ def measured(
     The goal, which a function on the host decides, and the dynamics count as kept.
 
     Args:
-        family: the problems.
         motion: states x_0..x_K (n, K + 1, nx) and controls (n, K, nu).
         off: x_K - plan, (n, ndx).
         extent: of the plans, from `extents`.
@@ -445,7 +441,6 @@ def by_entry(
     """Violations of one motion: of each entry of each kind in `MEASURED` that of its worst knot.
 
     Args:
-        problem: what was solved.
         motion: states x_0..x_K (K + 1, nx) and controls (K, nu).
         off: x_K - plan, (ndx,).
         extent: of the plan, from `extents`, without its first axis.

@@ -28,9 +28,6 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
 
     Dynamics and constraints are tolerated up to what makes a plan feasible: 1e-3 of the problem's
     `unit` of a state, and 1e-3 of a constraint.
-
-    Raises:
-        DraxError: the solution was loaded without its problem.
     """
     problem, plan, u, extent = _motion(solution, chain)
     off = defects(problem, plan, u)
@@ -46,11 +43,7 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
 
 
 def of_replay(solution: Results, chain: int) -> list[Violation]:
-    """Violations of a chain's better replay, the worst first.
-
-    Raises:
-        DraxError: the solution was loaded without its problem.
-    """
+    """Violations of a chain's better replay, the worst first."""
     problem, plan, _, extent = _motion(solution, chain)
     ran = solution.replays_in(solution.mode_of(chain))
     states, u = ran.states[chain], ran.controls[chain]
@@ -60,14 +53,9 @@ def of_replay(solution: Results, chain: int) -> list[Violation]:
 
 
 def table(solution: Results, chain: int | None = None, count: int = 10) -> str:
-    """The worst violations of a chain's plan and of its better replay, a line for each entry.
+    """The worst violations of a chain's plan and of its better replay; see `Solution.worst`.
 
     Entries that are not violated at all have no line.
-
-    Args:
-        solution: from `solve`.
-        chain: the best one by default.
-        count: at most so many lines for the plan, and for the replay.
     """
     chain, lines = solution.chain_or_best(chain), []
     mode = solution.mode_of(chain)

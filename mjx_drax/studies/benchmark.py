@@ -102,7 +102,7 @@ def run(
     suite: str | None = None,
     report: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """Measure; one row for every solve.
+    """Measure; one row for every solve. What cannot be measured is refused, see `check`.
 
     Args:
         names: tasks, by default all that the suite has.
@@ -110,9 +110,6 @@ def run(
         chains: for all tasks, instead of their own or the suite's number.
         suite: one of `SUITES`; by default tasks with their own settings.
         report: called with every row as it is ready.
-
-    Raises:
-        DraxError: see `check`.
     """
     check(names, suite)
     keep_none()

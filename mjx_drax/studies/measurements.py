@@ -222,10 +222,7 @@ def _judged(solution: Solution) -> tuple[float, float, float]:
 def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> Replays:
     """Open-loop replays of controls (n, K, nu), judged as certificates are.
 
-    Args:
-        problem: for its engine, goal and bounds.
-        u: the controls.
-        x_init: where each replay starts, (n, nx); by default the problem's for all.
+    Each starts at its x_init (n, nx), by default at the problem's.
     """
     ran = _replayed(problem, u, x_init)
     # As if what happened had been planned

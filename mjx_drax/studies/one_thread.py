@@ -21,9 +21,6 @@ def run(seed: int, chains: Sequence[int]) -> list[dict[str, Any]]:
 
     `solver` gets the suffix ", 1 thread"; rows of this solver also say how long IPOPT's median
     start took, `peer_median_s`.
-
-    Raises:
-        DraxError: the process fails.
     """
     result = subprocess.run(
         [sys.executable, "-m", __name__, str(seed), *map(str, chains)],

@@ -94,7 +94,6 @@ def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
     its own scale, written beside it, because units differ.
 
     Args:
-        solution: from `solve`.
         path: where to, ending in .png; its folder is made if need be.
 
     Raises:

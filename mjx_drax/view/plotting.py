@@ -60,7 +60,6 @@ def plot_solution(
     iterations; every chain's final cost.
 
     Args:
-        solution: from `solve`.
         path: where to, ending in .png; its folder is made if need be.
         draw: draw(axes, states (K + 1, nx)), for one more panel; tasks may have one.
 
@@ -91,7 +90,6 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
     `PANELS` coordinates of the state.
 
     Args:
-        solution: from `solve`.
         path: where to, ending in .png; its folder is made if need be.
         draw: draw(axes, states (K + 1, nx)); tasks may have one.
 

@@ -193,7 +193,6 @@ def motion_frames(
     """Frames (height, width, 3) uint8 of a motion, the last one held for half a second.
 
     Args:
-      model: what moves.
       qpos: positions (T, nq), interpolated between their times (along geodesics for quaternions).
       times: when they are reached (T,) [s], not decreasing.
       overlay: texts in a strip under each frame; `{time}` becomes the frame's time.
@@ -241,7 +240,6 @@ def outcome_lines(
     """Short texts about a chain, for a caption.
 
     Args:
-      solution: from `solve`.
       chain: the best one by default.
       plan: say what the plan breaks, not what came of its replay.
       brief: no more than the cost, the verdict, and what came of the replay or the plan breaks.

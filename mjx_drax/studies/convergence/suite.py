@@ -144,15 +144,9 @@ def line(row: Row) -> str:
 
 
 def run(chosen: Sequence[str], folder: Path, report: Callable[[str], None]) -> list[Row]:
-    """Measure in a process of its own; report the table line by line; write `convergence.json`.
+    """Measure problems, all by default, in a process of its own.
 
-    Args:
-        chosen: problems; all if empty.
-        folder: where the list of rows is written, after each row.
-        report: called with every line.
-
-    Raises:
-        DraxError: there is no such problem, or the process fails.
+    The table is reported line by line; after each, all rows are written to `convergence.json`.
     """
     for name in chosen:
         if name not in names():

@@ -100,7 +100,6 @@ def _callback(
     """A CasADi function of (z, p, ...) that calls `function` without p.
 
     Args:
-        name: what CasADi calls it.
         function: takes and returns numpy arrays; of a sparse matrix, its nonzero entries.
         inputs: the sizes of its arguments.
         outputs: sizes, or sparsity patterns.

@@ -108,9 +108,6 @@ def optimize(
         samples: N, rollouts of one iteration of one run.
         evaluations: of f; iterations = evaluations / (runs samples K), at least one.
         seed: of all random numbers.
-
-    Raises:
-        DraxError: a control without bounds.
     """
     _box(problem)
     K, nu = problem.horizon, problem.dynamics.nu

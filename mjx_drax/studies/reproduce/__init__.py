@@ -35,15 +35,9 @@ def run(
     iterations: int | None = None,
     full: bool = False,
 ) -> dict[str, Any]:
-    """Make one of `NAMES`; write NAME.png and NAME.json into a folder.
+    """Make one of `NAMES`; write NAME.png and NAME.json into a folder, and return its numbers.
 
     Default sizes take at most some ten minutes on two CPU cores; `full` takes those of the paper.
-
-    Returns:
-        the numbers, with the machine and versions that they were measured with.
-
-    Raises:
-        DraxError: the folder cannot be written to.
     """
     from mjx_drax.base.files import write_json
     from mjx_drax.search.settings import to_data

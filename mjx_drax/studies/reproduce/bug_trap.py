@@ -37,13 +37,9 @@ def make(
 ) -> tuple[Numbers, Figure]:
     """The same knots, and the same budget of iterations, for every method.
 
-    First-order methods have rows for `longer` times that budget too, because one of their
-    iterations costs less; these are drawn, as the paper draws them.
-
-    Args:
-        chains: of every method.
-        iterations: the budget; that of the preconditioned settings by default.
-        longer: factor of the second budget.
+    The budget is by default that of the preconditioned settings. First-order methods have rows for
+    `longer` times as much too, because one of their iterations costs less; these are drawn, as the
+    paper draws them.
     """
     problem = tasks.load("bug_trap").make()
     budget = iterations or settings.budget_of(settings.TRAP)

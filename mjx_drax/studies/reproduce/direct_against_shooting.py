@@ -52,12 +52,10 @@ LADDER = (*(0.5**i for i in range(9)), 0.0)
 def make(
     chains: int = 256, iterations: int | None = None, grid: tuple[int, int] = (2001, 1001)
 ) -> tuple[Numbers, Figure]:
-    """One chain of each method for every initial state.
+    """One chain of each method for every one of `chains` initial states.
 
-    Args:
-        chains: number of initial states.
-        iterations: of shooting; 300 by default, where its costs have long stopped to fall.
-        grid: numbers of angles and velocities for dynamic programming.
+    Shooting has 300 iterations by default, where its costs have long stopped to fall. The grid of
+    dynamic programming has so many angles and velocities.
     """
     problem = tasks.load("pendulum").make()
     starts = np.random.default_rng(0).uniform(-4, 4, (chains, 2)).astype(np.float32)

@@ -40,12 +40,8 @@ def make(
     """Each pendulum from its own random x_init, U(-4, 4)²; then the same with all hanging at rest.
 
     From many random states upright cannot be reached, from (3.1, 0) it can. Times are of compiled
-    programs, from drawing the initial knots to the final ones.
-
-    Args:
-        chains: leaves out larger N.
-        iterations: of the paper's flow; 20,000 by default.
-        sizes: values of N.
+    programs, from drawing the initial knots to the final ones. `chains` leaves out larger N of
+    `sizes`; the paper's flow has 20,000 iterations by default.
     """
     problem, solvers = tasks.load("pendulum").make(), settings.pendulum_flows(iterations)
     sizes = [n for n in sizes if chains is None or n <= chains] or [min(sizes)]

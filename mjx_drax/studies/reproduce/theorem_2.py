@@ -125,11 +125,8 @@ def make(
 ) -> tuple[Numbers, Figure]:
     """mu* over rho, steps and rates of decay over mu, and energies from starts near the optimum.
 
-    Args:
-        chains: starts near the optimum.
-        iterations: for which the energy is followed; 4,000 by default.
-        barriers: values of rho, rising.
-        penalties: values of mu.
+    There are `chains` starts, whose energy is followed for 4,000 iterations by default; barriers
+    are values of rho, rising, penalties values of mu.
     """
     with jax.enable_x64(True):
         problem = tasks.load("pendulum").make()
