@@ -6,7 +6,6 @@ Compiled code runs without Python's lock, so the control loop keeps its pace mea
 from __future__ import annotations
 
 import threading
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,12 +37,7 @@ class Background:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Wait for the plan in the making, and end the thread."""
         with self._wanted:
             self._open = False

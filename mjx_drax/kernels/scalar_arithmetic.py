@@ -11,7 +11,7 @@ An array of scalars is a numpy array: of numbers if all of its entries are known
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import reduce
+from functools import partialmethod, reduce
 from typing import Any
 
 import jax
@@ -109,29 +109,13 @@ class Arithmetic:
             return first
         return None
 
-    def add(self, a: Scalar, b: Scalar) -> Scalar:
-        """a + b."""
-        return self.apply(lax.add_p, (a, b))
+    def of(self, primitive: Any, *operands: Scalar) -> Scalar:
+        """An elementwise primitive of these operands."""
+        return self.apply(primitive, operands)
 
-    def sub(self, a: Scalar, b: Scalar) -> Scalar:
-        """a - b."""
-        return self.apply(lax.sub_p, (a, b))
-
-    def mul(self, a: Scalar, b: Scalar) -> Scalar:
-        """a b."""
-        return self.apply(lax.mul_p, (a, b))
-
-    def div(self, a: Scalar, b: Scalar) -> Scalar:
-        """a / b."""
-        return self.apply(lax.div_p, (a, b))
-
-    def neg(self, a: Scalar) -> Scalar:
-        """-a."""
-        return self.apply(lax.neg_p, (a,))
-
-    def sqrt(self, a: Scalar) -> Scalar:
-        """The square root of a."""
-        return self.apply(lax.sqrt_p, (a,))
+    add, sub = partialmethod(of, lax.add_p), partialmethod(of, lax.sub_p)
+    mul, div = partialmethod(of, lax.mul_p), partialmethod(of, lax.div_p)
+    neg, sqrt = partialmethod(of, lax.neg_p), partialmethod(of, lax.sqrt_p)
 
     def dot(self, a: Iterable[Scalar], b: Iterable[Scalar], dtype: Any) -> Scalar:
         """a'b; 0 if they are empty."""

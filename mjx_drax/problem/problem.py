@@ -32,6 +32,9 @@ from mjx_drax.problem.rollout import follow, in_double
 from mjx_drax.problem.tracing import require_shape
 from mjx_drax.problem.trajectory import Box, Knot, Stagewise, Trajectory, Values
 
+FUNCTIONS = ("dynamics", "running", "terminal", "constraint", "terminal_constraint")
+"""Attributes of a problem that hold functions."""
+
 STEP = "the dynamics f(x, u)"
 """What messages call f."""
 
@@ -108,14 +111,7 @@ class Problem:
 
     def at(self, knot: Knot) -> Problem:
         """The problem with all functions of a stage, or of the end, bound to one knot."""
-        return replace(
-            self,
-            dynamics=self.dynamics.at(knot),
-            running=self.running.at(knot),
-            terminal=self.terminal.at(knot),
-            constraint=self.constraint.at(knot),
-            terminal_constraint=self.terminal_constraint.at(knot),
-        )
+        return replace(self, **{name: getattr(self, name).at(knot) for name in FUNCTIONS})
 
     @property
     def end(self) -> Problem:
@@ -403,14 +399,7 @@ class Problem:
         no such limits.
         """
         with jax.enable_x64(True):
-            own = replace(
-                self,
-                dynamics=self.dynamics.in_float64(),
-                running=self.running.in_float64(),
-                terminal=self.terminal.in_float64(),
-                constraint=self.constraint.in_float64(),
-                terminal_constraint=self.terminal_constraint.in_float64(),
-            )
+            own = replace(self, **{name: getattr(self, name).in_float64() for name in FUNCTIONS})
             numbers = jax.tree.map(lambda leaf: jnp.asarray(in_double(leaf)), own)
         return with_host_fields(numbers, own)
 

@@ -9,18 +9,10 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.extended import Extended
 
-_POSITIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "qw", "qx", "qy", "qz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("qw", "qx", "qy", "qz"),
-}
-_ROTATIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("x", "y", "z", "rx", "ry", "rz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("rx", "ry", "rz"),
-}
-_VELOCITIES = {
-    int(mujoco.mjtJoint.mjJNT_FREE): ("vx", "vy", "vz", "wx", "wy", "wz"),
-    int(mujoco.mjtJoint.mjJNT_BALL): ("wx", "wy", "wz"),
-}
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_POSITIONS = {_FREE: ("x", "y", "z", "qw", "qx", "qy", "qz"), _BALL: ("qw", "qx", "qy", "qz")}
+_ROTATIONS = {_FREE: ("x", "y", "z", "rx", "ry", "rz"), _BALL: ("rx", "ry", "rz")}
+_VELOCITIES = {_FREE: ("vx", "vy", "vz", "wx", "wy", "wz"), _BALL: ("wx", "wy", "wz")}
 
 
 def state_names(dynamics: Dynamics) -> list[str]:
