@@ -357,8 +357,10 @@ class MPC:
         if np.isfinite(x).all():
             further = np.asarray(plan.x[k, len(x) :], float)
             planned = self._between(plan.x[k], plan.x[k + 1], s - k)[: len(x)]
-            v = self._last_controls(plan.time + k * step)
-            own = further if v is None else np.append(further[: len(further) - len(v)], v)
+            own, applied = further, self._applied
+            if applied is not None and applied.any:  # rates are counted from what was applied
+                v = applied.before(plan.time + k * step, self._step)
+                own = np.append(further[: len(further) - len(v)], v)
             off = dynamics.host_difference(np.append(x, own), np.append(planned, further))
             u = u + plan.gains[k] @ off
         else:
@@ -416,12 +418,6 @@ class MPC:
         if isinstance(dynamics, Extended) and dynamics.phases:
             return with_time_passed(problem, t - self._began)
         return problem
-
-    def _last_controls(self, t: float) -> np.ndarray | None:
-        """Those before time t [s] that rates are counted from, (order * nu,); None without."""
-        if self._applied is None or not self._applied.any:
-            return None
-        return self._applied.before(t, self._step)
 
     def _begin(self, t: float) -> None:
         """Forget what was applied; a free duration begins at time t [s]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -71,31 +72,18 @@ def simulate(
         pushes: the plant's, to be reported.
     """
     require_positive("duration", duration, "a positive number of seconds")
-    if realtime:
-        with Background(policy) as background:
-            return _driven(policy, background, plant, duration, True, pushes)
-    return _driven(policy, policy, plant, duration, False, pushes)
-
-
-def _driven(
-    policy: MPC,
-    act: Callable[[np.ndarray, float], np.ndarray],
-    plant: Plant,
-    duration: float,
-    realtime: bool,
-    pushes: Sequence[Push],
-) -> Motion:
     times, states, controls, further = [plant.time], [plant.state], [], []
-    began = time.perf_counter() - plant.time
-    while plant.time < duration - 1e-9:
-        u = act(plant.measured(), plant.time)
-        plant.step(u)
-        controls.append(u)
-        further.append(policy.latest.x[0, len(plant.state) :])
-        times.append(plant.time)
-        states.append(plant.state)
-        if realtime:
-            time.sleep(max(0.0, began + plant.time - time.perf_counter()))
+    with Background(policy) if realtime else nullcontext(policy) as act:
+        began = time.perf_counter() - plant.time
+        while plant.time < duration - 1e-9:
+            u = act(plant.measured(), plant.time)
+            plant.step(u)
+            controls.append(u)
+            further.append(policy.latest.x[0, len(plant.state) :])
+            times.append(plant.time)
+            states.append(plant.state)
+            if realtime:
+                time.sleep(max(0.0, began + plant.time - time.perf_counter()))
     end = states[-1]
     reached = policy.problem.reached(end) if np.isfinite(end).all() else False
     found = np.array(times), np.array(states), np.array(controls)

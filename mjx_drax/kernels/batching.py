@@ -101,8 +101,7 @@ def thread_for_each_row(
         common: arrays that all rows read.
         interpret: run it without a GPU.
 
-    Returns:
-        what the body writes, (*shape, rows).
+    What the body writes is (*shape, rows).
     """
     from jax.experimental import pallas as pl  # only here: it takes a second
     from jax.experimental.pallas.triton import CompilerParams
@@ -137,13 +136,10 @@ def block_for_each_row(
 
     Args:
         body: body(*arrays, *results), which reads and writes references of one row, (1, ...).
-        shapes: of the results, (rows, ...), by name.
+        shapes: of the results, (rows, ...), by the names under which they are returned.
         arrays: of shapes (rows, ...); entries of rows are powers of two.
         warps: how many groups of 32 threads work on a row.
         interpret: run it without a GPU.
-
-    Returns:
-        what the body writes, by name.
     """
     from jax.experimental import pallas as pl  # only here: it takes a second
     from jax.experimental.pallas.triton import CompilerParams

@@ -179,23 +179,22 @@ def _trajectories(solution: Solution, everything: bool) -> dict[str, Any]:
         one, other = (getattr(replays, name)[chains] for replays in (open_loop, feedback))
         return np.where(is_open.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
-    plans = solution.plans
+    of_replays = (
+        "states",
+        "controls",
+        "max_deviation",
+        "final_deviation",
+        "max_violation",
+        "success",
+    )
+    of_plans = "gains", "cost", "max_defect", "residual", "feasible"
     return {
-        "states": replayed("states"),
-        "controls": replayed("controls"),
-        "plan_states": plans[chains],
+        **{name: replayed(name) for name in of_replays},
+        **{name: getattr(solution, name)[chains] for name in of_plans},
+        "plan_states": solution.plans[chains],
         "plan_controls": solution.trajectories.u[chains],
-        "gains": solution.gains[chains],
         "mode": [OPEN_LOOP if o else WITH_FEEDBACK for o in is_open],
-        "max_deviation": replayed("max_deviation"),
-        "final_deviation": replayed("final_deviation"),
-        "max_violation": replayed("max_violation"),
         "replay_cost": replayed("cost"),
-        "success": replayed("success"),
         "chain": chains,
-        "cost": solution.cost[chains],
-        "max_defect": solution.max_defect[chains],
-        "residual": solution.residual[chains],
-        "feasible": solution.feasible[chains],
         "optimal": solution.optimal_chains[chains],
     }

@@ -125,17 +125,14 @@ def _read(folder: Path) -> tuple[dict[str, Any], Arrays]:
 def _solution(
     cls: type[Loaded], problem: Problem, summary: dict[str, Any], arrays: Arrays
 ) -> Loaded:
+    of_bounds: Any = None
+    if "solution.multipliers.bounds.0.x" in arrays:
+        sides = ("solution.multipliers.bounds.0", "solution.multipliers.bounds.1")
+        of_bounds = tuple(_trajectory(side, arrays) for side in sides)
     multipliers = Multipliers(
         arrays["solution.multipliers.dynamics"],  # type: ignore[arg-type]
         _stagewise("solution.multipliers.constraints", arrays),
-        (
-            (
-                _trajectory("solution.multipliers.bounds.0", arrays),
-                _trajectory("solution.multipliers.bounds.1", arrays),
-            )
-            if "solution.multipliers.bounds.0.x" in arrays
-            else None
-        ),
+        of_bounds,
     )
     history = {k.removeprefix("history_"): v for k, v in arrays.items() if k.startswith("history_")}
     return cls(

@@ -226,15 +226,8 @@ def minimize(
     with program.arithmetic():
         knots = None if guess is None else _knots(guess, chains, program.dynamics.nu)
         settings = settled(program, chains, seed, solver, tolerance, max_iterations)
-        mesh = mesh_for(chains)
-        search = Search(
-            Family.of_one(program),
-            chains,
-            seed,
-            settings,
-            mesh=mesh,
-            guess=knots,
-        )
+        own, mesh = Family.of_one(program), mesh_for(chains)
+        search = Search(own, chains, seed, settings, mesh=mesh, guess=knots)
         with report as search.progress, said_plainly(f"the solve of {program.name}"):
             found = search.run()
         state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities

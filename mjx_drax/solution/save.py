@@ -49,8 +49,7 @@ OPTIMA = 32
 
 def summary(solution: Results) -> dict[str, Any]:
     """What `result.json` holds: settings, the best chain's numbers, certificate, versions."""
-    best, certificate = solution.best_chain, solution.certificate
-    status, polished = solution.status, solution.polished
+    best, status, polished = solution.best_chain, solution.status, solution.polished
     dynamics = solution.problem.dynamics
     own = dynamics.inner if isinstance(dynamics, Extended) else dynamics
     of_vectors = type(own).difference is Dynamics.difference
@@ -90,11 +89,7 @@ def summary(solution: Results) -> dict[str, Any]:
         "optimal_rate": float(solution.optimal_chains.mean()),
         "status": {name: status.count(name) for name in sorted(set(status))},
         "polished": {name: polished.count(name) for name in sorted(set(polished))},
-        "certificate": {
-            "engine": certificate.engine,
-            "open_loop": certificate.open_loop,
-            "feedback": certificate.feedback,
-        },
+        "certificate": vars(solution.certificate),
         "tolerances": to_data(solution.tolerances),
         "optima_found": len(solution.optima),
         "optima": [_answer(optimum) for optimum in solution.optima[:OPTIMA]],
@@ -160,18 +155,11 @@ def arrays(solution: Results) -> dict[str, np.ndarray]:
 
 def _answer(optimum: Optimum) -> dict[str, Any]:
     """One of the optima in `result.json`; share is of all chains."""
-    return {
-        "chain": optimum.chain,
-        "cost": optimum.cost,
-        "plan_cost": optimum.plan_cost,
-        "max_defect": optimum.max_defect,
-        "residual": optimum.residual,
-        "optimal": optimum.optimal,
-        "members": len(optimum.members),
-        "share": optimum.share,
-        "open_loop": optimum.certificate.open_loop,
-        "feedback": optimum.certificate.feedback,
-    }
+    names = "chain", "cost", "plan_cost", "max_defect", "residual", "optimal", "share"
+    own = {name: getattr(optimum, name) for name in names}
+    certificate = optimum.certificate
+    ways = {"open_loop": certificate.open_loop, "feedback": certificate.feedback}
+    return {**own, "members": len(optimum.members), **ways}
 
 
 def _whole(solution: Results) -> dict[str, np.ndarray]:

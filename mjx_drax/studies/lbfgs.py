@@ -160,9 +160,7 @@ class BFGS(LBFGS):
         cross = jnp.outer(moved, s) / product
         new = inverse + factor * jnp.outer(s, s) - cross - cross.T
         return replace(
-            memory,
-            inverse=jnp.where(good, new, memory.inverse),
-            began=memory.began | good,
+            memory, inverse=jnp.where(good, new, memory.inverse), began=memory.began | good
         )
 
     def _inverse_times(self, memory: Any, gradient: Array) -> Array:

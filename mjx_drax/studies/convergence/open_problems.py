@@ -320,12 +320,7 @@ def alpha_pinene() -> Problem:
         gain = c * y[2], d * y[2] - e * y[4]
         return jnp.stack([-(a + b) * y[0], a * y[0], b * y[0] - sum(gain), *gain])
 
-    return estimation(
-        rate,
-        [100.0, 0.0, 0.0, 0.0, 0.0],
-        *table(PINENE, 5, 6),
-        np.full(5, 50.0),
-    )
+    return estimation(rate, [100.0, 0.0, 0.0, 0.0, 0.0], *table(PINENE, 5, 6), np.full(5, 50.0))
 
 
 CASES = {

@@ -164,11 +164,7 @@ PROGRAMS = {
         [1.0, 0.5],
         [3.0, 3**0.5],
         -1.0,
-        inequality=lambda a, b: [
-            b - a / 3**0.5,
-            -a - 3**0.5 * b,
-            a + 3**0.5 * b - 6,
-        ],
+        inequality=lambda a, b: [b - a / 3**0.5, -a - 3**0.5 * b, a + 3**0.5 * b - 6],
         lower=0.0,
     ),
     "hs026": Program(
@@ -239,11 +235,7 @@ PROGRAMS = {
         [0.8, 0.8, 0.8, 0.8],
         [2 ** (-1 / 3), 2 ** (-1 / 2), 2 ** (-11 / 12), 2 ** (-1 / 4)],
         -0.25,
-        equality=lambda a, b, c, d: [
-            a**3 + b**2 - 1,
-            a**2 * d - c,
-            d**2 - b,
-        ],
+        equality=lambda a, b, c, d: [a**3 + b**2 - 1, a**2 * d - c, d**2 - b],
     ),
     "hs042": Program(
         lambda a, b, c, d: (a - 1) ** 2 + (b - 2) ** 2 + (c - 3) ** 2 + (d - 4) ** 2,

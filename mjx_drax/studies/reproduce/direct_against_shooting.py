@@ -42,6 +42,9 @@ FULL = {"chains": 16_384, "grid": (6001, 1401)}
 BARRIER = 0.1, 1e-6
 """Weight of the barrier in shooting, at the first and at the last iteration."""
 
+Outcome = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+"""Feasible, upright, cost of each state, and seconds for all."""
+
 Carried = tuple[Trajectory, Array]
 """The rollout of a chain, and its damping."""
 
@@ -76,7 +79,7 @@ def make(
     whole = np.ones(chains, bool)  # a rollout obeys the dynamics
     shooting = whole, replayed.success, replayed.cost, seconds
     can = can | upright | replayed.success  # the grid is not perfect
-    rows = [_row("direct", best, can, *direct), _row("shooting", best, can, *shooting)]
+    rows = [_row("direct", best, can, direct), _row("shooting", best, can, shooting)]
     figure = new_figure(9.0, 3.8)
     reached = {"direct": upright, "shooting": replayed.success}
     for i, (name, good) in enumerate(reached.items()):
@@ -95,16 +98,9 @@ def make(
     return {"rows": rows, "states that can be upright": float(can.mean()), "settings": {}}, figure
 
 
-def _row(
-    name: str,
-    best: np.ndarray,
-    can: np.ndarray,
-    feasible: np.ndarray,
-    upright: np.ndarray,
-    cost: np.ndarray,
-    seconds: float,
-) -> Numbers:
+def _row(name: str, best: np.ndarray, can: np.ndarray, came: Outcome) -> Numbers:
     """What one method came to."""
+    feasible, upright, cost, seconds = came
     return {
         "method": name,
         "states": len(can),
