@@ -24,17 +24,12 @@ from mjx_drax.cli.common import at_least_1, say
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Which tasks, how often, and where to."""
-    parser.add_argument("tasks", nargs="*", metavar="TASK", help="default: all of them")
-    parser.add_argument("--suite", metavar="SUITE", help="default: each task as it is, alone")
-    parser.add_argument(
-        "--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="S", help="default 0 1 2"
-    )
-    parser.add_argument(
-        "--chains", type=at_least_1, metavar="N", help="default: each task's, or the suite's"
-    )
-    parser.add_argument(
-        "--out", metavar="DIR", default="out/benchmark", help="default out/benchmark"
-    )
+    add = parser.add_argument
+    add("tasks", nargs="*", metavar="TASK", help="default: all of them")
+    add("--suite", metavar="SUITE", help="default: each task as it is, alone")
+    add("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="S", help="default 0 1 2")
+    add("--chains", type=at_least_1, metavar="N", help="default: each task's, or the suite's")
+    add("--out", metavar="DIR", default="out/benchmark", help="default out/benchmark")
 
 
 def run(options: argparse.Namespace) -> int:

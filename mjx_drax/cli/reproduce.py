@@ -12,25 +12,22 @@ __doc__ += "\n\n" + "\n".join(f"{name:24} {shows}" for name, shows in reproduce.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Which figure, its size, and where to."""
-    parser.add_argument(
-        "name", metavar="NAME", choices=reproduce.NAMES, help="one of the names above"
-    )
-    parser.add_argument(
-        "--out", metavar="DIR", default="out/reproduce", help="default out/reproduce"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("name", metavar="NAME", choices=reproduce.NAMES, help="one of the names above")
+    add("--out", metavar="DIR", default="out/reproduce", help="default out/reproduce")
+    add(
         "--chains",
         type=at_least_1,
         metavar="N",
         help="number of chains; parallel-table leaves out larger N",
     )
-    parser.add_argument(
+    add(
         "--iterations",
         type=at_least_1,
         metavar="K",
         help="number of iterations, instead of the usual one",
     )
-    parser.add_argument(
+    add(
         "--full",
         action="store_true",
         help="the sizes of the paper, for a GPU; without it less than ten minutes on two CPU cores",

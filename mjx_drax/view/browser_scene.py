@@ -74,7 +74,6 @@ class ReplayScene:
 
     Attributes:
         times: of the knots that can be shown [s], (T,).
-        alike: whether the replay keeps to the plan.
     """
 
     def __init__(self, server: viser.ViserServer, solution: Solution, ghosts: int) -> None:
@@ -88,7 +87,6 @@ class ReplayScene:
         open_loop = solution.replay_mode == OPEN_LOOP
         follows = certificate.open_loop if open_loop else certificate.feedback
         self.times = solution.times_of(solution.best_chain)[: len(states)]
-        self.alike = bool(follows["max_deviation"] < _ALIKE)
         self._forces = _segments(model, contact_forces(model, states, controls))
         scene = server.scene
         shapes = shapes_of(model, states[:, : model.nq], server)
@@ -97,7 +95,7 @@ class ReplayScene:
             name: scene.add_frame(f"/{name}", show_axes=False)
             for name in ("replay", "plan", "ghosts")
         }
-        self.parts["plan"].visible = not self.alike
+        self.parts["plan"].visible = not follows["max_deviation"] < _ALIKE
         self._frames = add_robot(scene, "replay", shapes, replayed, None)
         self._frames += add_robot(scene, "plan", shapes, planned, _PLAN_COLOR)
         knots = np.unique(np.linspace(0, len(planned[0]) - 1, ghosts).round().astype(int))

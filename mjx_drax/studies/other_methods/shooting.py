@@ -82,7 +82,6 @@ class Runs:
     Attributes:
         seconds: since the start, (reports,) [s], compilation excluded.
         u: controls of the cheapest rollouts so far, (reports, runs, K, nu).
-        cost: of those, (reports, runs).
         iterations: of every run.
         evaluations: of f, all runs together.
         compile_time: [s].
@@ -90,7 +89,6 @@ class Runs:
 
     seconds: np.ndarray
     u: np.ndarray
-    cost: np.ndarray
     iterations: int
     evaluations: int
     compile_time: float
@@ -121,16 +119,15 @@ def optimize(
     jax.block_until_ready(advance(method, problem, plans, keys, 0, 0, total, samples))
     compile_time = time.perf_counter() - clock
 
-    clock, seconds, records = time.perf_counter(), [], []
+    clock, seconds, controls = time.perf_counter(), [], []
     stops = np.unique(np.linspace(0, total, REPORTS + 1).round().astype(int)).tolist()
     for start, stop in pairwise(stops):
         plans = advance(method, problem, plans, keys, start, stop, total, samples)
-        records.append(jax.block_until_ready((plans.u, plans.cost)))
+        controls.append(jax.block_until_ready(plans.u))
         seconds.append(time.perf_counter() - clock)
     return Runs(
         seconds=np.array(seconds),
-        u=np.stack([np.asarray(u) for u, _ in records]),
-        cost=np.stack([np.asarray(cost) for _, cost in records]),
+        u=np.stack([np.asarray(u) for u in controls]),
         iterations=total,
         evaluations=total * runs * samples * K,
         compile_time=compile_time,
