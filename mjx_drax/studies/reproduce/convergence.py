@@ -44,22 +44,13 @@ def make(
     rows, series = [], {}
     for mu, color in zip(penalties, CURVES, strict=False):
         tell(f"convergence: μ = {mu:g}")
-        step = stable_step(flow, mu)
-        solver = replace(flow, penalty=Constant(mu), step_size=step)
-        squares, state = violations(solver, problem, chains, stops)
+        squares, state, row = followed(flow, problem, mu, chains, stops)
         low, median, high = np.nanquantile(squares, (0.1, 0.5, 0.9), axis=1)
-        rows.append(
-            {
-                "mu": mu,
-                "step size": step,
-                "iterations": total,
-                "chains": chains,
-                **outcome(problem, state, squares[-1]),
-                "diverged": float(np.mean(~np.asarray(state.alive))),
-            }
-        )
+        diverged = float(np.mean(~np.asarray(state.alive)))
+        rows.append({"mu": mu, **row, "diverged": diverged})
         curves = {"p10": low, "median": median, "p90": high}
         series[f"mu={mu:g}"] = {name: values.tolist() for name, values in curves.items()}
+        step = row["step size"]
         label = f"μ = {mu:g}" + ("" if step == usual else f",  α = {step:g}")
         axes.fill_between(stops, low, high, color=color, alpha=0.2, lw=0)
         axes.plot(stops, median, color=color, lw=1.6, label=label)
@@ -79,34 +70,35 @@ def make(
     }, figure
 
 
-def stable_step(flow: Langevin, mu: float) -> float:
-    """alpha: the flow's own, and less where a large mu would make it unstable."""
-    return min(float(np.asarray(flow.step_size)), 0.25 / mu)
+def followed(
+    flow: Langevin, problem: Problem, mu: float, chains: int, stops: np.ndarray
+) -> tuple[np.ndarray, State, Numbers]:
+    """|h|^2 (stops, chains) after so many iterations with a penalty, the last state, and its row.
 
-
-def violations(
-    solver: Langevin, problem: Problem, chains: int, stops: np.ndarray
-) -> tuple[np.ndarray, State]:
-    """|h|^2 (stops, chains) after the given numbers of iterations, and the last state."""
-    knots = settings.initial_knots(problem, chains)
-    state = start(solver, problem, knots, jax.random.key(0))
+    alpha is the flow's own, and less where a large mu would make it unstable.
+    """
+    step = min(float(np.asarray(flow.step_size)), 0.25 / mu)
+    solver = replace(flow, penalty=Constant(mu), step_size=step)
+    state = start(solver, problem, settings.initial_knots(problem, chains), jax.random.key(0))
     squares = [np.asarray(_square(problem, state.trajectory))]
     for begin, end in pairwise(stops):
         state, _ = advance(solver, problem, state, int(begin), int(end))
         squares.append(np.asarray(_square(problem, state.trajectory)))
-    return np.stack(squares), state
-
-
-def outcome(problem: Problem, state: State, squares: np.ndarray) -> Numbers:
-    """What a row says of the last knots, whose |h|^2 are `squares` (chains,)."""
     defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
     upright = judge(problem, np.asarray(state.trajectory.u, float)).success
-    return {
-        "median |h|²": float(np.nanmedian(squares)),
-        "median max|h|": float(np.median(defect)),
-        "feasible": float(np.mean(defect < FEASIBLE)),
-        "rollout upright": float(np.mean(upright)),
-    }
+    return (
+        np.stack(squares),
+        state,
+        {
+            "step size": step,
+            "iterations": int(flow.iterations),
+            "chains": chains,
+            "median |h|²": float(np.nanmedian(squares[-1])),
+            "median max|h|": float(np.median(defect)),
+            "feasible": float(np.mean(defect < FEASIBLE)),
+            "rollout upright": float(np.mean(upright)),
+        },
+    )
 
 
 @jax.jit

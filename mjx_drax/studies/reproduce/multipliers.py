@@ -15,10 +15,9 @@ from mjx_drax import tasks
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.metrics import Direction, Identity, Metric
 from mjx_drax.method.model import Model
-from mjx_drax.method.schedules import Constant
 from mjx_drax.problem.problem import Problem
 from mjx_drax.studies.reproduce import settings
-from mjx_drax.studies.reproduce.convergence import outcome, stable_step, violations
+from mjx_drax.studies.reproduce.convergence import followed
 from mjx_drax.studies.reproduce.output import Numbers, tell
 from mjx_drax.view.plotting import BLUE, VERMILLION, label_axes, new_figure
 
@@ -53,24 +52,14 @@ def make(
     for mu in penalties:
         for name, metric in kinds.items():
             tell(f"multipliers: μ = {mu:g}, {name}")
-            step = stable_step(flow, mu)
-            solver = replace(flow, penalty=Constant(mu), step_size=step, preconditioner=metric)
-            squares, state = violations(solver, problem, chains, stops)
-            rows.append(
-                {
-                    "mu": mu,
-                    "multipliers": name,
-                    "step size": step,
-                    "iterations": int(flow.iterations),
-                    "chains": chains,
-                    **outcome(problem, state, squares[-1]),
-                }
-            )
+            own = replace(flow, preconditioner=metric)
+            *_, row = followed(own, problem, mu, chains, stops)
+            rows.append({"mu": mu, "multipliers": name, **row})
     figure = new_figure(5.4, 3.6)
     axes = figure.subplots()
     for name, color, marker in zip(kinds, (BLUE, VERMILLION), "o^", strict=True):
-        own = [row["median |h|²"] for row in rows if row["multipliers"] == name]
-        axes.loglog(penalties, own, f"{marker}-", color=color, label=name)
+        medians = [row["median |h|²"] for row in rows if row["multipliers"] == name]
+        axes.loglog(penalties, medians, f"{marker}-", color=color, label=name)
     label_axes(axes, "penalty μ", "median |h|² at the end")
     title = f"Paper's flow, pendulum, {int(flow.iterations):,} iterations"
     axes.set_title(title, loc="left", fontsize=9)
