@@ -33,11 +33,11 @@ def cut(text: str, width: int = 160) -> str:
     return text if len(text) <= width else f"{text[: width - 5 - end]} ... {text[-end:]}"
 
 
-def reason(error: BaseException, width: int = 160) -> str:
+def reason(error: BaseException) -> str:
     """What an exception says, in one line, with its type."""
     lines = str(error).strip().splitlines()
     text = f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
-    return cut(text, width)
+    return cut(text)
 
 
 def is_number(value: object) -> bool:
