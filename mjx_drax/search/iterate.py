@@ -103,9 +103,14 @@ def chain_keys(key: Array, chains: int) -> Array:
 
 @jax.jit
 def restart_at(own: Question, shared: Question, states: State, knots: Trajectory) -> State:
-    """The chains with other knots (rows, K, ...), and slacks that go with them."""
-    inside = by_row(shared, own, lambda q, z: q.flow.inside(q.problem, z), knots)
-    return State(**{**vars(states), "trajectory": inside})
+    """The chains with other knots (rows, K, ...), slacks that go with them, and a new polish."""
+
+    def moved(q: Question, state: State, knots: Trajectory) -> State:
+        state = replace(state, trajectory=q.flow.inside(q.problem, knots))
+        return state if q.polish is None else interior_point.begin(q.problem, state)
+
+    restarted: State = by_row(shared, own, moved, states, knots)
+    return restarted
 
 
 def loop(

@@ -59,19 +59,19 @@ class Rollouts:
     """After an attempt, plans are replaced by rollouts of their controls, and improved from there.
 
     Where contacts switch, linear models of f are wrong, and steps that trust them leave defects. A
-    rollout has none. So each chain takes its rollout, and then every few iterations of the tail are
-    rolled out with their feedback: what is feasible and cheaper is kept, and chains for which it is
-    not are damped more.
+    rollout has none. So each chain takes its rollout, and then every few iterations of the polish,
+    or of the tail without one, are rolled out with their feedback: what is feasible and cheaper is
+    kept, and chains for which it is not are damped more.
 
     Attributes:
         first: rollouts right after the attempt: one without feedback, the others with it.
         rounds: largest number of rounds that follow; 0 with first=0: no rollouts.
-        iterations: of the tail, in each round.
+        iterations: in each round; the first and the last of a polish take no step.
     """
 
     first: int = 2
     rounds: int = 30
-    iterations: int = 2
+    iterations: int = 6
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,7 @@ class Restarts:
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
-            `Polish()` with the tolerance of the precision, unless f has kinks or derivatives are
-            sampled.
+            `Polish()` with the tolerance of the precision, unless derivatives are sampled.
     """
 
     flow: Langevin = field(
@@ -155,8 +154,8 @@ class Restarts:
         return replace(self, **{n: v for n, v in values.items() if getattr(self, n) is None})
 
     def _polish_for(self, problem: Problem) -> Polish:
-        """The default polish; without iterations where f has kinks or derivatives are sampled."""
-        if problem.dynamics.kinked or not isinstance(self.flow.preconditioner, GaussNewton):
+        """The default polish; without iterations where derivatives are sampled."""
+        if not isinstance(self.flow.preconditioner, GaussNewton):
             return Polish(iterations=0)
         if not isinstance(self.flow.preconditioner.derivatives, Autodiff):
             return Polish(iterations=0)

@@ -94,8 +94,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         name, _, chains = word.partition(":")
         problem = tasks.load(name).make()
         for what, solver in (("flow", flow), ("polish", polish)):
-            if what == "polish" and problem.dynamics.kinked:
-                continue
             print(f"\n## {name}, {chains or 64} chains, {what}\n")
             measured(problem, int(chains or 64), solver, n, rows)
 

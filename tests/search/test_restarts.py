@@ -216,7 +216,7 @@ def test_a_tolerance_and_iterations_of_the_polish_are_arguments(balls):
     ):
         settings = settled(problem, 4, 0, solver, tolerance, iterations)
         assert (settings.polish.tolerance, settings.polish.iterations) == found
-    assert settled(kinked, 4, 0, None).polish.iterations == 0
+    assert settled(kinked, 4, 0, None).polish == Polish(1e-4)
     assert settled(kinked, 4, 0, None, 1e-3).polish == Polish(1e-3)
 
 
@@ -305,7 +305,7 @@ def test_settings_that_depend_on_the_problem(balls):
     assert (smooth.within, smooth.enough, smooth.heated) == (0.1, 0.95, True)
     assert (kinked.within, kinked.enough, kinked.heated) == (1.0, 0.6, False)
     assert (smooth.rollouts, kinked.rollouts) == (NO_ROLLOUTS, Rollouts())
-    assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(iterations=0))
+    assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(1e-4))
     sampled = replace(TINY, preconditioner=GaussNewton(derivatives=Smoothed()))
     for flow in (sampled, replace(TINY, preconditioner=Identity())):
         assert Restarts(flow).for_problem(balls[0]).polish == Polish(iterations=0)
@@ -313,7 +313,7 @@ def test_settings_that_depend_on_the_problem(balls):
         assert Restarts().for_problem(bouncing(kinked=None)).polish == Polish(1e-8)
     solver = Restarts(TINY, descent=4, attempts=2)
     found = solve(balls[1], chains=2, solver=solver).solver
-    rest = {"rollouts": Rollouts(), "polish": Polish(iterations=0)}
+    rest = {"rollouts": Rollouts(), "polish": Polish(1e-4)}
     assert found == replace(solver, within=1.0, enough=0.6, heated=False, **rest)
 
 
