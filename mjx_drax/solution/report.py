@@ -115,7 +115,7 @@ def optima_lines(solution: Results) -> list[str]:
     for rank, optimum in enumerate(found[:OPTIMA], 1):
         replays = optimum.certificate.open_loop, optimum.certificate.feedback
         open_loop, feedback = (outcomes[replay["success"]] for replay in replays)
-        residual = "-" if math.isnan(optimum.residual) else f"{optimum.residual:.1e}"
+        residual = f"{optimum.residual:.1e}" if math.isfinite(optimum.residual) else "-"
         table.append(
             f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback:13}  "
             f"{residual}"
