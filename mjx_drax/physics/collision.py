@@ -7,8 +7,8 @@
   has others where a capsule is steeper than 60 degrees.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
   points on them.
-- Two polytopes touch at every point once, where MJX repeats some, and hulls of meshes take less
-  memory (`polytopes`).
+- Two polytopes touch at every point once, where MJX repeats some, and halfway between their faces;
+  hulls of meshes take less memory (`polytopes`).
 - Hulls of meshes have the normals of their faces; see `polytope`. Pairs of hulls of similar sizes
   are one computation, where MJX has one for each pair, which takes seconds each to compile.
 - Pairs of geoms can be left out, by `exclude_signature` of the MJX model.
@@ -385,7 +385,7 @@ def with_corners(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Con
 
 
 def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
-    """The same of boxes with meshes, and of two meshes; `key.data_ids` as in `_merged`."""
+    """The same of boxes and meshes; `key.data_ids` as in `_merged`."""
     stacks = [None if size < 0 else _alike(model, size) for size in key.data_ids]
 
     def hull(place: int, g: Array) -> ConvexMesh:
@@ -400,7 +400,7 @@ def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Co
         turn, origin = data.geom_xmat[other], data.geom_xpos[other]
         centre, axes = turn.T @ (data.geom_xpos[one] - origin), turn.T @ data.geom_xmat[one]
         placed = polytopes.moved(hull(0, one), centre, axes)
-        dist, pos, normal = polytopes.contacts(placed, hull(1, other), len(geom))
+        dist, pos, normal = polytopes.contacts(placed, hull(1, other), len(geom), not any(stacks))
         frame = jnp.repeat(make_frame(turn @ normal)[None], len(dist), axis=0)
         return dist, pos @ turn.T + origin, frame
 
@@ -435,7 +435,7 @@ def _function(collide: Any, contacts: int) -> Any:
     return function
 
 
-_HULLS = {(BOX, MESH), (MESH, MESH)}
+_HULLS = {(BOX, BOX), (BOX, MESH), (MESH, MESH)}
 """Kinds of geoms that `between_hulls` collides."""
 
 _CYLINDERS, _ELLIPSOIDS = _function(with_corners, 4), _function(with_corners, 1)
@@ -450,7 +450,7 @@ _OWN = {
     (ELLIPSOID, MESH): _ELLIPSOIDS,
     (CYLINDER, BOX): _CYLINDERS,
     (CYLINDER, MESH): _CYLINDERS,
-    (BOX, BOX): _distinct(COLLISIONS[BOX, BOX]),
+    (BOX, BOX): _distinct(between_hulls),
     (BOX, MESH): _distinct(between_hulls),
     (MESH, MESH): _distinct(between_hulls),
 }

@@ -39,12 +39,13 @@ APART = 1.0
 Contacts = tuple[Array, Array, Array]
 
 
-def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1) -> Contacts:
+def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = False) -> Contacts:
     """Four contacts: distances (4,), positions (4, 3), and their normal (3,) from one to other.
 
     Args:
         one, other: in the same frame.
         alike: so many pairs of a state are computed at once, by `jax.vmap`.
+        boxes: whether both are boxes, which the C engine has functions of their own for.
     """
     one, other = jax.tree.map(jnp.asarray, (one, other))
     a, b = lax.stop_gradient((one, other))
@@ -76,8 +77,10 @@ def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1) -> Contacts:
     beside = lax.stop_gradient(across @ axis) < ASIDE
     nearer = jnp.where(least < 0, gap > least - SAME, (gap < 0) & jnp.isfinite(gap))
     nearer |= beside & (gap > jnp.max(gaps) + SAME)
-    # As in the C engine, faces touch along the normal of the second one, halfway between both
-    normal = -normals[1]
+    nearer = gap > jnp.max(gaps) + SAME if boxes else nearer
+    # As in the C engine, faces touch halfway between both, those of boxes along the normal of the
+    # face with the least overlap, others along that of the second one
+    normal = axis if boxes else -normals[1]
     pos = pos + jnp.where(of_one, 0.5, -0.5) * dist[:, None] * normal
     (start, end), (first, last) = one.vert[one.edge[p]], other.vert[other.edge[q]]
     points = closest_segment_to_segment_points(start, end, first, last)

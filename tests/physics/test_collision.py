@@ -142,6 +142,27 @@ def test_two_boxes_touch_at_every_point_once():
             assert len(np.unique(acting, axis=0)) == len(acting)
 
 
+def test_a_box_lies_on_a_box_as_in_the_c_engine():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="box" size=".25 .35 .2"/>
+        <body><freejoint/><geom type="box" size=".02 .03 .04"/></body></worldbody></mujoco>"""
+    )
+    wanted, rng, counts = mujoco.MjData(model), np.random.default_rng(0), set()
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for tilt in [0.0] + [0.01] * 20:
+            wanted.qpos[:] = [0.01, 0.02, 0.2395, 1, *rng.normal(size=3) * tilt]
+            mujoco.mj_forward(model, wanted)
+            found, there = find(wanted), wanted.contact
+            acting = np.asarray(found.dist) < 0
+            one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], there.pos))
+            for name in ("dist", "pos", "frame"):
+                here, c = getattr(found, name)[acting][one], getattr(there, name)[other]
+                np.testing.assert_allclose(here, c.reshape(here.shape), atol=1e-9)
+            counts.add(wanted.ncon)
+    assert counts >= {2, 3, 4}
+
+
 def test_hulls_of_meshes_have_no_corner_outside_of_a_face():
     rng = np.random.default_rng(0)
     angle = np.linspace(0, 2 * np.pi, 45)[:-1]
