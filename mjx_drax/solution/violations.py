@@ -338,16 +338,13 @@ def scatter_widths(problem: Problem) -> tuple[Array, Array, Array]:
 
     1 where it has none, or an infinite one.
     """
-    box = problem.scatter
-
-    def width(lower: Array, upper: Array) -> Array:
-        return jnp.atleast_2d(upper - lower).max(axis=0)
+    box, (of_differences, of_controls) = problem.scatter, problem.widths
 
     def usable(width: Array) -> Array:
         return jnp.where((width > 0) & jnp.isfinite(width), width, 1.0)
 
-    x, u = width(box.x_lower, box.x_upper), width(box.u_lower, box.u_upper)
-    return usable(x), usable(problem.dynamics.tangent(x)), usable(u)
+    of_states = jnp.atleast_2d(box.x_upper - box.x_lower).max(axis=0)
+    return usable(of_states), usable(of_differences), usable(of_controls)
 
 
 def _sizes_and_tolerances(
