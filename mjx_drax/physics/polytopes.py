@@ -75,9 +75,10 @@ def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = F
     _, p, q, gap = lax.fori_loop(0, ROUNDS, round_, (direction, none, none, gaps[0]))
     across, least = _normal(one, other, p, q), jnp.max(lax.stop_gradient(dist))
     beside = lax.stop_gradient(across @ axis) < ASIDE
-    nearer = jnp.where(least < 0, gap > least - SAME, (gap < 0) & jnp.isfinite(gap))
-    nearer |= beside & (gap > jnp.max(gaps) + SAME)
-    nearer = gap > jnp.max(gaps) + SAME if boxes else nearer
+    nearer = gap > jnp.max(gaps) + SAME
+    if not boxes:
+        nearer &= beside
+        nearer |= jnp.where(least < 0, gap > least - SAME, (gap < 0) & jnp.isfinite(gap))
     # As in the C engine, faces touch halfway between both, those of boxes along the normal of the
     # face with the least overlap, others along that of the second one
     normal = axis if boxes else -normals[1]

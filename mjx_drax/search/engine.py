@@ -56,8 +56,8 @@ REPORT_EVERY = 20
 """Iterations between two reports, records of the history, and chances to interrupt; a hundredth
 of an attempt's where that is more."""
 
-STRICTER, MOST = 10.0, 0.5
-"""Factor on the scale of costs after an attempt; the share of feasible chains that prevents it."""
+STRICTER, FEW = 10.0, 0.5
+"""Factor on the scale of costs after an attempt that leaves a smaller share of chains feasible."""
 
 NEGLIGIBLE = 1e-3
 """Differences of cost below so many scales of costs do not count."""
@@ -353,7 +353,7 @@ class Search:
             return False
         scale = stage.cost_scale.copy()
         feasible = kept.feasible.reshape(shape).mean(axis=1)
-        scale[feasible < MOST] *= STRICTER  # the knots' cost says too little: penalize defects more
+        scale[feasible < FEW] *= STRICTER  # the knots' cost says too little: penalize defects more
         self.stage = replace(stage, attempt=stage.attempt + 1, cost_scale=scale, todo=todo, place=0)
         return True
 

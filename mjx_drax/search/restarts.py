@@ -96,7 +96,8 @@ class Restarts:
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
-            `Polish()` with the tolerance of the precision, unless derivatives are sampled.
+            `Polish()` with the tolerance of the precision, unless derivatives are sampled or the
+            metric is not `GaussNewton`.
     """
 
     flow: Langevin = field(
@@ -154,12 +155,11 @@ class Restarts:
         return replace(self, **{n: v for n, v in values.items() if getattr(self, n) is None})
 
     def _polish_for(self, problem: Problem) -> Polish:
-        """The default polish; without iterations where derivatives are sampled."""
-        if not isinstance(self.flow.preconditioner, GaussNewton):
-            return Polish(iterations=0)
-        if not isinstance(self.flow.preconditioner.derivatives, Autodiff):
-            return Polish(iterations=0)
-        return Polish(TOLERANCE[problem.x_init.dtype.itemsize])
+        """The default polish; none if derivatives are sampled or the metric is another."""
+        metric = self.flow.preconditioner
+        if isinstance(metric, GaussNewton) and isinstance(metric.derivatives, Autodiff):
+            return Polish(TOLERANCE[problem.x_init.dtype.itemsize])
+        return Polish(iterations=0)
 
     def with_iterations(self, iterations: int) -> Restarts:
         """Other numbers of iterations, in proportion to those with noise."""

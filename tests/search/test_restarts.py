@@ -28,7 +28,8 @@ from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
 from mjx_drax.search.engine import Chains, Search, _owners, best_of
 from mjx_drax.search.family import Family
-from mjx_drax.search.iterate import iterate
+from mjx_drax.search.initial import initial_knots
+from mjx_drax.search.iterate import Question, begin, iterate, partition, restart_at
 from mjx_drax.search.restarts import Rollouts, settled
 
 DT, K = 0.1, 20
@@ -265,6 +266,16 @@ def two_balls(ball, rollouts=None, **changes):
 
 def with_start(ball, x):
     return replace(ball, x_init=x)
+
+
+def test_a_stalled_chain_that_is_moved_is_polished_again():
+    problem, key = swing(), jax.random.key(0)
+    shared, own = partition(Question(Restarts().flow, problem, polish=Polish(1e-4)), None)
+    knots = initial_knots(problem, 2, None, key)
+    state = begin(own, shared, knots, key)
+    stalled = replace(state, polish=replace(state.polish, stalled=jnp.ones(2, bool)))
+    assert not stalled.polish.active.any()
+    assert restart_at(own, shared, stalled, knots).polish.active.all()
 
 
 @pytest.mark.slow
