@@ -4,19 +4,21 @@
 
 A row for each task and seed: the share of chains whose replay succeeds; the best and the median
 cost of those; the share of all chains within 1 % of the best, and the share that is optimal, with
-a residual below the tolerance; iterations; and seconds to solve and to compile. Of each task the
-first row's solve time has work that is done once in a process.
+a residual below the tolerance; whether the best chain is certified; iterations; and seconds to
+solve and to compile. Of each task the first row's solve time has work that is done once in a
+process.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
 
 from mjx_drax import tasks
+from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 
@@ -31,8 +33,8 @@ DEFAULT = (
 )
 
 HEADER = (
-    "| problem | chains | seed | success | best cost | median | within 1 % | optimal | iterations "
-    "| solve [s] | compile [s] |\n" + "|---" * 11 + "|"
+    "| problem | chains | seed | success | best cost | median | within 1 % | optimal | certified "
+    "| iterations | solve [s] | compile [s] |\n" + "|---" * 12 + "|"
 )
 
 
@@ -46,8 +48,21 @@ def line(solution: Solution) -> str:
     return (
         f"| {solution.problem.name} | {solution.chains:,} | {solution.seed} | {good.mean():.2%} "
         f"| {best:.6g} | {median:.5g} | {close:.0%} | {optimal.mean():.1%} "
-        f"| {solution.iterations} | {solution.solve_time:.3f} | {solution.compile_time:.0f} |"
+        f"| {'yes' if solution.certified else 'no'} | {solution.iterations} "
+        f"| {solution.solve_time:.3f} | {solution.compile_time:.0f} |"
     )
+
+
+def start() -> str:
+    """What the table begins with: the device, and the names of the columns."""
+    return f"{jax.devices()[0].device_kind}, jax {jax.__version__}\n\n{HEADER}"
+
+
+def answers(problem: Problem, chains: int, seeds: int) -> Iterator[tuple[str, Solution]]:
+    """The row and the solution of each seed."""
+    for seed in range(seeds):
+        solution = solve(problem, chains=chains, seed=seed, progress=False)
+        yield line(solution), solution
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,15 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("tasks", nargs="*", default=DEFAULT)
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="solves of each task")
     options = parser.parse_args(arguments)
-    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}\n\n{HEADER}", flush=True)
+    print(start(), flush=True)
     for word in options.tasks:
         name, _, chains = word.partition(":")
-        problem = tasks.load(name).make()
-        for seed in range(options.seeds):
-            print(
-                line(solve(problem, chains=int(chains or 64), seed=seed, progress=False)),
-                flush=True,
-            )
+        for row, _ in answers(tasks.load(name).make(), int(chains or 64), options.seeds):
+            print(row, flush=True)
 
 
 if __name__ == "__main__":

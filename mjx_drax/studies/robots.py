@@ -1,10 +1,10 @@
 """Small tasks for robots of other packages, from their files as they are shipped.
 
-    python -m mjx_drax.studies.robots [NAME ...] [--path DIR] [--chains N] [--seed S] [--out DIR]
+    python -m mjx_drax.studies.robots [NAME ...] [--path DIR] [--chains N] [--seeds N]
 
 A file is sought by its path inside of its package (`TASKS`), as in hydrax/models/walker/scene.xml:
-below DIR, or where the package is installed. Nothing of a package is imported. A Markdown table
-says how many chains succeed, and whether the best one is certified by MuJoCo's C engine.
+below DIR, or where the package is installed. Nothing of a package is imported. The table is that
+of `studies.answers`; a model that is refused stands below it, with the reason.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import importlib.util
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from mjx_drax.physics.mjcf import from_mjcf
 from mjx_drax.physics.motors import Actuators, add_motors
 from mjx_drax.physics.source import load
 from mjx_drax.problem.problem import Problem
-from mjx_drax.studies.third_party import Row, solved, told
+from mjx_drax.studies.answers import answers, start
 
 
 def double_cart_pole(path: Path) -> Problem:
@@ -238,30 +239,31 @@ def model_file(inside: str, folder: Path | None = None) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Solve, print the table, write `robots.json`; 0 if every best chain is certified."""
+    """Solve and print the table; 0 if every best chain is certified."""
     parser = argparse.ArgumentParser(prog="python -m mjx_drax.studies.robots", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(TASKS)}")
     parser.add_argument("--path", type=Path, metavar="DIR", help="where the packages' files lie")
     parser.add_argument("--chains", type=int, default=16)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", metavar="DIR", help="where robots.json goes")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="solves of each task")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in TASKS]
     if unknown:
         print(f"there is no task {', '.join(unknown)}: use {', '.join(TASKS)}.", file=sys.stderr)
         return 2
-
-    def measured(name: str) -> Row:
+    print(start(), flush=True)
+    certified, refused = True, []
+    for name in options.names or TASKS:
         inside, make = TASKS[name]
         try:
-            found = solved(make(model_file(inside, options.path)), options.chains, options.seed)
+            problem = replace(make(model_file(inside, options.path)), name=name)
         except DraxError as error:
-            found = {"refused": str(error)}
-        return {"model": name, **found}
-
-    names = options.names or TASKS
-    rows = told(map(measured, names), options.out and Path(options.out) / "robots.json")
-    return 0 if all(row.get("certified") for row in rows) else 1
+            refused.append(f"{name}: {error}")
+            continue
+        for row, solution in answers(problem, options.chains, options.seeds):
+            print(row, flush=True)
+            certified = certified and solution.certified
+    print("\n".join(["", *refused]))
+    return 0 if certified and not refused else 1
 
 
 if __name__ == "__main__":
