@@ -54,6 +54,10 @@ BEYOND = 0.01
 SHIFT, SPEED = 0.02, 0.5
 """Standard deviations of positions [rad, m] and velocities about x_init, for one more state."""
 
+HAIR = 1e-4
+"""Share of these by which x_init itself is moved: of feet that are just on the ground, rounding
+decides whether they touch it."""
+
 
 def checked_start(
     model: mujoco.MjModel, name: str, x_init: ArrayLike | None = None
@@ -202,7 +206,7 @@ def _require_stable(engine: Engine, name: str, x_init: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Samples:
-    """States (n, nx), x_init first, and controls (n, nu) at which the engines are compared."""
+    """States (n, nx), x_init's first, and controls (n, nu) at which the engines are compared."""
 
     x: np.ndarray
     u: np.ndarray
@@ -224,7 +228,7 @@ class StepErrors:
 
 
 def samples(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int = 0) -> Samples:
-    """x_init, a state close to it, and states along motions under constant random controls.
+    """x_init but for a hair, a state close to it, and states along motions under random controls.
 
     Args:
         engine: which makes the motions.
@@ -236,7 +240,8 @@ def samples(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int =
     nv, scale = model.nv, np.zeros(2 * model.nv + model.na)
     scale[:nv], scale[nv : 2 * nv] = SHIFT, SPEED
     u = rng.uniform(*control_ranges(model), (2 + len(MOMENTS), model.nu))
-    x = [x_init, integrate(model, x_init, scale * rng.normal(size=scale.shape))]
+    away = scale * rng.normal(size=scale.shape)
+    x = [integrate(model, x_init, share * away) for share in (HAIR, 1.0)]
     for moment, control in zip(MOMENTS, u[2:], strict=True):
         x.append(engine.step(x_init, control, max(1, round(moment / model.opt.timestep))))
     states, where = np.stack(x), model.jnt_qposadr[bounded]

@@ -387,6 +387,9 @@ def with_corners(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Con
 def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
     """The same of boxes and meshes; `key.data_ids` as in `_merged`."""
     stacks = [None if size < 0 else _alike(model, size) for size in key.data_ids]
+    boxes = not any(stacks)
+    margins = jnp.concatenate([jnp.asarray(model.geom_margin), jnp.asarray(model.pair_margin)])
+    reach = jnp.max(margins) if boxes else 0.0
 
     def hull(place: int, g: Array) -> ConvexMesh:
         stack = stacks[place]
@@ -400,7 +403,7 @@ def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Co
         turn, origin = data.geom_xmat[other], data.geom_xpos[other]
         centre, axes = turn.T @ (data.geom_xpos[one] - origin), turn.T @ data.geom_xmat[one]
         placed = polytopes.moved(hull(0, one), centre, axes)
-        dist, pos, normal = polytopes.contacts(placed, hull(1, other), len(geom), not any(stacks))
+        dist, pos, normal = polytopes.contacts(placed, hull(1, other), len(geom), boxes, reach)
         frame = jnp.repeat(make_frame(turn @ normal)[None], len(dist), axis=0)
         return dist, pos @ turn.T + origin, frame
 
@@ -418,7 +421,7 @@ def _distinct(collide: Any) -> Any:
         dist, pos, frame = collide(model, data, key, geom)
         four = pos.reshape(-1, 4, 3)
         same = jnp.max(jnp.abs(four[:, :, None] - four[:, None]), axis=-1) < SAME
-        again = jnp.any(jnp.tril(same, -1) & (dist.reshape(-1, 1, 4) < 0), axis=2)
+        again = jnp.any(jnp.tril(same, -1) & (dist.reshape(-1, 1, 4) < curved.APART), axis=2)
         return jnp.where(again.reshape(-1), curved.APART, dist), pos, frame
 
     return _function(function, 4)

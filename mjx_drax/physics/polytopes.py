@@ -14,6 +14,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.typing import ArrayLike
 
 from mjx_drax.physics._mjx import (
     ConvexMesh,
@@ -39,13 +40,16 @@ APART = 1.0
 Contacts = tuple[Array, Array, Array]
 
 
-def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = False) -> Contacts:
+def contacts(
+    one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = False, reach: ArrayLike = 0.0
+) -> Contacts:
     """Four contacts: distances (4,), positions (4, 3), and their normal (3,) from one to other.
 
     Args:
         one, other: in the same frame.
         alike: so many pairs of a state are computed at once, by `jax.vmap`.
         boxes: whether both are boxes, which the C engine has functions of their own for.
+        reach: how far apart boxes still touch [m]; others touch where they overlap.
     """
     one, other = jax.tree.map(jnp.asarray, (one, other))
     a, b = lax.stop_gradient((one, other))
@@ -63,9 +67,11 @@ def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = F
     most = max(one.face.shape[1], other.face.shape[1])
     faces = _padded(one.face[i], most), _padded(other.face[j], most)
     normals = one.face_normal[i], other.face_normal[j]
-    dist, pos, _ = contact_manifold(
-        *(jnp.where(of_one, *pair) for pair in (faces, faces[::-1], normals, normals[::-1])), -axis
-    )
+    clipping, subject = (jnp.where(of_one, *pair) for pair in (faces, faces[::-1]))
+    out, facing = (jnp.where(of_one, *pair) for pair in (normals, normals[::-1]))
+    # What is in front of the face that clips is not found, so that face is moved ahead
+    dist, pos, _ = contact_manifold(clipping + reach * out, subject, out, facing, -axis)
+    dist, pos = dist + reach, pos - reach * out
 
     def round_(_: int, found: tuple[Array, ...]) -> tuple[Array, ...]:
         p, q, gap = _edges(a, b, found[0])
@@ -88,7 +94,8 @@ def contacts(one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = F
     alone = jnp.full_like(dist, APART).at[0].set(across @ (first - start))
     dist = jnp.where(nearer, alone, dist)
     pos = jnp.where(nearer, 0.5 * (points[0] + points[1]), pos)
-    return jnp.where(jnp.max(gaps) > 0, APART, dist), pos, jnp.where(nearer, across, normal)
+    apart = jnp.max(gaps) > (reach if boxes else 0.0)
+    return jnp.where(apart, APART, dist), pos, jnp.where(nearer, across, normal)
 
 
 def moved(hull: ConvexMesh, centre: Array, turn: Array) -> ConvexMesh:

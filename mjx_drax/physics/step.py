@@ -32,7 +32,6 @@ from jax.custom_derivatives import SymbolicZero
 from mjx_drax.kernels.constraint_solver import (
     ITERATIONS,
     LEAST_SHARE,
-    SIZES,
     Constraints,
     constrained_minimum,
 )
@@ -52,6 +51,10 @@ from mjx_drax.physics.tree import (
     mass_matrix,
     rne,
 )
+
+SIZES = 24
+"""Step sizes, 1, 1/2, 1/4, ..., of Newton's method among elliptic cones, whose curvature changes
+fast where a contact is about to open."""
 
 RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 """Of each stage: the share of the timestep that it goes along the rate of the stage before, and its
