@@ -2,12 +2,15 @@
 
 The acceleration a minimizes
 
-    1/2 (a - a0)' M (a - a0) + sum_i s_i(J_i a - aref_i),      M a0 = force
+    1/2 (a - a0)' M (a - a0) + sum_i s_i(J_i a - aref_i)
 
-where s_i(y) is D y^2 / 2 for y < 0, for rows of `both` sides for all y, and goes on as a line where
-dry friction of the size `loss` slides, |y| >= loss / D. The function is piecewise quadratic: once
-the constraints that are active stay the same, a full step ends at the minimum; before, a shorter
-one may be better. On GPUs one kernel does all iterations of a row, in a block of threads.
+where s_i'(y) is D y, clipped where a contact or a limit opens, y > 0, or where dry friction slides.
+The function is piecewise quadratic: once the constraints that are active stay the same, a full step
+ends at the minimum; before, a shorter one may be better. On GPUs one kernel does all iterations of
+a row, in a block of threads.
+
+Forces may be larger than what they leave over by more digits than numbers have. So only changes of
+the function are computed, and M a0, which is the sum of all other forces, is never taken from M a.
 """
 
 from __future__ import annotations
@@ -41,7 +44,7 @@ from mjx_drax.kernels.riccati_blocks import (
 )
 
 ITERATIONS, SIZES = 20, 8
-"""Most iterations, and how many step sizes each chooses from, 1, 1/2, 1/4, ..."""
+"""Most iterations, and how many step sizes each chooses from, 1, 1/2, 1/4, ..., and one between."""
 
 LEAST_SHARE = 1e-3
 """Least share of its predicted decrease that a step must achieve for another one to follow. In
@@ -52,28 +55,33 @@ MOST_DOFS, MOST_ROWS = 64, 128
 
 
 class Constraints(NamedTuple):
-    """M (nv, nv), J (m, nv), D, aref, loss and both (m,), force and a0 (nv,)."""
+    """M (nv, nv), J (m, nv), D and aref (m,), a0 (nv,).
+
+    D y is clipped to D lower and D upper, (m,): 0 and infinity of what pulls or pushes to both
+    sides; -infinity and 0 of a contact or a limit, which only pushes.
+    """
 
     M: Array
     J: Array
     D: Array
     aref: Array
-    loss: Array
-    both: Array
-    force: Array
+    lower: Array
+    upper: Array
     a0: Array
 
 
-def law(given: Constraints, y: Array) -> tuple[Array, Array, Array]:
-    """s(y), -s'(y) and s''(y) of y = J a - aref, (..., m)."""
-    far = jnp.abs(y) * given.D >= given.loss
-    slides = far & (given.loss > 0)
-    acts = ((y < 0) | (given.both > 0)) & ~slides
-    line = given.loss * (jnp.abs(y) - 0.5 * given.loss / jnp.where(slides, given.D, 1.0))
-    cost = jnp.where(slides, line, jnp.where(acts, 0.5 * given.D * y * y, 0.0))
-    push = jnp.where(y < 0, given.loss, -given.loss)
-    push = jnp.where(slides, push, jnp.where(acts, -given.D * y, 0.0))
-    return cost, push, jnp.where(acts, given.D, 0.0)
+def law(given: Constraints, y: Array) -> tuple[Array, Array]:
+    """-s'(y) and s''(y) of y = J a - aref, (..., m)."""
+    clipped = jnp.clip(y, given.lower, given.upper)
+    return -given.D * clipped, jnp.where(clipped == y, given.D, 0.0)
+
+
+def changes(given: Constraints, y: Array, h: Array) -> tuple[Array, Array]:
+    """s(y + h) - s(y) - s'(y) h and s'(y + h) - s'(y), (..., m)."""
+    later = y + h
+    here, there = (jnp.clip(a, given.lower, given.upper) for a in (y, later))
+    moved = jnp.where((here == y) & (there == later), h, there - here)
+    return given.D * moved * (later - there + 0.5 * moved), given.D * moved
 
 
 def iterated(
@@ -86,42 +94,52 @@ def iterated(
         newton: newton(H, g) -> H^{-1} g, and what is left of H.
         left: an array like what is left, or None.
     """
-    M, J, force, a0 = given.M, given.J, given.force, given.a0
-    sizes = jnp.exp2(-lax.iota(jnp.int32, SIZES).astype(a0.dtype))
-
-    def total(off: Array, rest: Array, y: Array) -> Array:
-        """What is minimized, (n,), for a - a0, M a - force and J a - aref, (n, ...)."""
-        return 0.5 * jnp.sum(rest * off, axis=1) + jnp.sum(law(given, y)[0], axis=1)
+    M, J, a0 = given.M, given.J, given.a0
+    eps, sizes = jnp.finfo(a0.dtype).eps, jnp.exp2(-lax.iota(jnp.int32, SIZES).astype(a0.dtype))
 
     def iteration(carry: Any) -> Any:
-        count, _, *here, cost, _ = carry
+        count, _, *here, _ = carry
         _, rest, y = here
-        _, push, slope = law(given, y)
-        gradient = rest - transposed_times(J, push)
+        push, slope = law(given, y)
+        pull = transposed_times(J, push)
+        gradient = rest - pull
         direction, left = newton(M + product((J * slope[:, None]).T, J), gradient)
         along = direction, times(M, direction), times(J, direction)
-        # Changes are added up: values from anew differ by rounding, which could look like progress
-        costs = total(
-            *(a[None] - sizes[:, None] * d[None] for a, d in zip(here, along, strict=True))
-        )
-        lowest = jnp.min(costs)
-        size = jnp.max(jnp.where(costs == lowest, sizes, 0.0))
-        rounding = jnp.finfo(cost.dtype).eps * jnp.abs(cost)
-        least = jnp.maximum(rounding, LEAST_SHARE * jnp.sum(gradient * direction))
-        better = cost - lowest > least
-        size, cost = jnp.where(better, size, 0.0), jnp.where(better, lowest, cost)
-        return (
-            count + 1,
-            better,
-            *(a - size * d for a, d in zip(here, along, strict=True)),
-            cost,
-            left,
-        )
+        first, second = jnp.sum(gradient * direction), jnp.sum(direction * along[1])
 
-    here = jnp.zeros_like(a0), times(M, a0) - force, times(J, a0) - given.aref
-    begin = 0, True, *here, jnp.sum(total(*(a[None] for a in here))), left
+        def tried(sizes: Array) -> tuple[Array, Array]:
+            """Change of what is minimized by steps of these sizes (n,), and its slope there."""
+            h = -sizes[:, None] * along[2][None]
+            change, slope = changes(given, y[None], h)
+            change = sizes * (0.5 * sizes * second - first) + jnp.sum(change, axis=1)
+            return change, sizes * second - first - jnp.sum(slope * along[2][None], axis=1)
+
+        change, slope = tried(sizes)
+        size = _level(sizes, slope, -first)
+        between, least = jnp.sum(tried(size[None])[0]), jnp.min(change)
+        on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
+        size, least = jnp.where(between < least, size, on_ladder), jnp.minimum(between, least)
+        rounding = eps * jnp.sum(jnp.abs(direction) * (jnp.abs(rest) + jnp.abs(pull)))
+        better = -least > jnp.maximum(rounding, LEAST_SHARE * first)
+        size = jnp.where(better, size, 0.0)
+        return count + 1, better, *(a - size * d for a, d in zip(here, along, strict=True)), left
+
+    none = jnp.zeros_like(a0)
+    begin = 0, True, none, none, times(J, a0) - given.aref, left
     end = lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], iteration, begin)
     return a0 + end[2], end[-1]
+
+
+def _level(sizes: Array, slopes: Array, slope: Array) -> Array:
+    """Where a convex function's slope is about 0, from those at 0 and at falling sizes (n,)."""
+    rises = slopes > 0.0
+    far = jnp.min(jnp.where(rises, sizes, 2.0))
+    near = jnp.max(jnp.where(rises, 0.0, sizes))
+    at_far = jnp.sum(jnp.where(sizes == far, slopes, 0.0))
+    at_near = jnp.where(near > 0.0, jnp.sum(jnp.where(sizes == near, slopes, 0.0)), slope)
+    bracketed = at_far > at_near
+    share = -at_near / jnp.where(bracketed, at_far - at_near, 1.0)
+    return jnp.where(bracketed & (far < 2.0), near + share * (far - near), 1.0)
 
 
 def _plain(given: Constraints) -> tuple[Array, Array]:
@@ -134,7 +152,7 @@ def _plain(given: Constraints) -> tuple[Array, Array]:
 
 def _factor(given: Constraints, a: Array) -> Array:
     """Of the Hessian at a."""
-    _, _, slope = law(given, times(given.J, a) - given.aref)
+    _, slope = law(given, times(given.J, a) - given.aref)
     return cholesky(symmetric(given.M + (given.J * slope[:, None]).T @ given.J))
 
 
@@ -162,7 +180,7 @@ def minima(given: Constraints, interpret: bool = False) -> Array:
     """The accelerations (rows, nv) by the kernel; every array leads with the axis of rows."""
     m, n = given.J.shape[-2:]
     M, N = tile(m), tile(n)
-    shapes = (N, N), (M, N), (M,), (M,), (M,), (M,), (N,), (N,)
+    shapes = (N, N), (M, N), (M,), (M,), (M,), (M,), (N,)
     arrays = [padded(a, *shape) for a, shape in zip(given, shapes, strict=True)]
     precision = lax.Precision.HIGHEST if interpret else SPLIT
     body = partial(_body, n, partial(product, precision=precision))

@@ -141,10 +141,14 @@ def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
     model, data = jax.lax.stop_gradient((model, data))
     if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
         rows = internal(data)
-        both = np.arange(len(rows.efc_D)) < rows.ne + rows.nf
-        of_rows = rows.efc_D, rows.efc_aref, rows.efc_frictionloss, both.astype(data.qvel.dtype)
-        start = data.qfrc_smooth, data.qacc_smooth
-        return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, *start))
+        loss, D = rows.efc_frictionloss, rows.efc_D
+        slides = loss / jnp.where(D > 0.0, D, 1.0)
+        always = np.arange(len(D)) < rows.ne + rows.nf
+        held = jnp.where(always, jnp.inf, 0.0).astype(D.dtype)
+        lower = jnp.where(loss > 0.0, -slides, -jnp.inf)
+        upper = jnp.where(loss > 0.0, slides, held)
+        of_rows = D, rows.efc_aref, lower, upper
+        return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, data.qacc_smooth))
     law = partial(_law, model, data)
 
     def hessian(qacc: Array) -> Array:

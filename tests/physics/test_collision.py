@@ -82,7 +82,7 @@ def meeting(kind, other, margin=0.0):
 
 
 def approached(model, count, depth, seed=0):
-    """Data of the C engine with geoms in random poses that overlap by up to `depth` [m]."""
+    """Data of the C engine with geoms in random poses that overlap by up to `depth` [m], or are apart."""
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     for _ in range(count):
         direction = rng.normal(size=3)
@@ -95,7 +95,7 @@ def approached(model, count, depth, seed=0):
             mujoco.mj_kinematics(model, data)
             apart = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None) > 0
             near, far = (near, middle) if apart else (middle, far)
-        data.qpos[:3] = (near - rng.uniform(0, depth)) * direction
+        data.qpos[:3] = (near - depth * rng.uniform()) * direction
         mujoco.mj_forward(model, data)
         yield data
 
@@ -161,6 +161,22 @@ def test_a_box_lies_on_a_box_as_in_the_c_engine():
                 np.testing.assert_allclose(here, c.reshape(here.shape), atol=1e-9)
             counts.add(wanted.ncon)
     assert counts >= {2, 3, 4}
+
+
+@pytest.mark.parametrize("depth", [0.004, -0.008])
+def test_boxes_that_overlap_or_are_within_their_margin_touch_as_in_the_c_engine(depth):
+    model = meeting("box", BOXES, margin=0.01)
+    with jax.enable_x64(True):
+        find, close = contacts_of(model), []
+        for wanted in approached(model, 60, depth):
+            found, there = find(wanted), wanted.contact
+            nearest = int(np.argmin(found.dist))
+            if not wanted.ncon:
+                close.append(found.dist[nearest] > 0.01)
+                continue
+            off = np.linalg.norm(there.pos - found.pos[nearest], axis=1).min()
+            close.append(abs(found.dist[nearest] - there.dist.min()) < 1e-6 and off < 1e-5)
+    assert np.mean(close) >= 0.95
 
 
 def test_hulls_of_meshes_have_no_corner_outside_of_a_face():
