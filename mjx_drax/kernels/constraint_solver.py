@@ -98,7 +98,7 @@ def iterated(
     eps, sizes = jnp.finfo(a0.dtype).eps, jnp.exp2(-lax.iota(jnp.int32, SIZES).astype(a0.dtype))
 
     def iteration(carry: Any) -> Any:
-        count, _, *here, _ = carry
+        count, _, *here, nothing, _ = carry
         _, rest, y = here
         push, slope = law(given, y)
         pull = transposed_times(J, push)
@@ -107,25 +107,26 @@ def iterated(
         along = direction, times(M, direction), times(J, direction)
         first, second = jnp.sum(gradient * direction), jnp.sum(direction * along[1])
 
-        def tried(sizes: Array) -> tuple[Array, Array]:
-            """Change of what is minimized by steps of these sizes (n,), and its slope there."""
-            h = -sizes[:, None] * along[2][None]
-            change, slope = changes(given, y[None], h)
-            change = sizes * (0.5 * sizes * second - first) + jnp.sum(change, axis=1)
-            return change, sizes * second - first - jnp.sum(slope * along[2][None], axis=1)
+        def tried(sizes: Array, h: Array) -> tuple[Array, Array]:
+            """Change of what is minimized by steps of these sizes, and its slope there."""
+            of_rows, rise = changes(given, y, h)
+            change = nothing + sizes * (0.5 * sizes * second - first) + jnp.sum(of_rows, axis=-1)
+            return change, sizes * second - first - jnp.sum(rise * along[2], axis=-1)
 
-        change, slope = tried(sizes)
-        size = _level(sizes, slope, -first)
-        between, least = jnp.sum(tried(size[None])[0]), jnp.min(change)
+        change, slope = tried(sizes, -sizes[:, None] * along[2][None])
+        size, least = _level(sizes, slope, -first), jnp.min(change)
+        between, _ = tried(size, -size * along[2])
         on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
         size, least = jnp.where(between < least, size, on_ladder), jnp.minimum(between, least)
         rounding = eps * jnp.sum(jnp.abs(direction) * (jnp.abs(rest) + jnp.abs(pull)))
         better = -least > jnp.maximum(rounding, LEAST_SHARE * first)
         size = jnp.where(better, size, 0.0)
-        return count + 1, better, *(a - size * d for a, d in zip(here, along, strict=True)), left
+        moved = (a - size * d for a, d in zip(here, along, strict=True))
+        return count + 1, better, *moved, 0.0 * least, left
 
     none = jnp.zeros_like(a0)
-    begin = 0, True, none, none, times(J, a0) - given.aref, left
+    # Without a number that is carried on, the compiler of kernels crashes; this one stays 0
+    begin = 0, True, none, none, times(J, a0) - given.aref, jnp.zeros((), a0.dtype), left
     end = lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], iteration, begin)
     return a0 + end[2], end[-1]
 

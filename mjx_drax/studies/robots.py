@@ -15,6 +15,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -143,17 +144,19 @@ def legs(
     feet: str,
     path: Path,
     forward: float = 0.0,
-    bend: float = 1.0,
+    bends: tuple[float, float] = (1.0, 1.0),
     actuators: Actuators | None = None,
 ) -> Problem:
-    """From a posture on the floor to the same posture, some way ahead or with bent legs."""
+    """From a posture on the floor to the same, some way ahead; legs are bent `bends` times."""
     spec = mujoco.MjSpec.from_file(str(path))
+    if actuators is not None:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # for stiff servos
     spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1])
     spec.option.gravity = [0, 0, -9.81]  # robosuite's files have none
     if actuators is not None:
         add_motors(spec, actuators, spec.modelname)
     model = spec.compile()
-    start, end = (_standing(model, posture, feet, by) for by in (1.0, bend))
+    start, end = (_standing(model, posture, feet, by) for by in bends)
     end[0] += forward
     on = Terms(model)
     weights = np.append(np.full(6, 300.0), np.full(model.nv - 6, 3.0))
@@ -184,10 +187,64 @@ def _standing(
         data.qpos[model.jnt_qposadr[j]] = by * angle
     data.qpos[2] = 2.0
     mujoco.mj_kinematics(model, data)
-    names = [model.geom(g).name for g in range(model.ngeom)]
-    down = [g for g, name in enumerate(names) if name and Path(name).match(feet)]
+    names = [(model.geom(g).name, model.body(b).name) for g, b in enumerate(model.geom_bodyid)]
+    touches = (model.geom_contype | model.geom_conaffinity) != 0
+    down = [g for g in np.flatnonzero(touches) if any(fnmatch(n, feet) for n in names[g])]
     data.qpos[2] -= min(mujoco.mj_geomDistance(model, data, g, ground, 9.0, None) for g in down)
     return data.qpos.copy()
+
+
+def fetch(path: Path) -> Problem:
+    """Pushes the block on the table 8 cm ahead, with servos in the arm."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:2] = 0.405, 0.48  # where the base stands
+    model.eq_data[0, 3:10] = np.eye(7)[3]  # the gripper goes to where the mocap body is
+    data.mocap_pos[0], data.mocap_quat[0] = (1.22, 0.75, 0.44), (1.0, 0.0, 1.0, 0.0)
+    mujoco.mj_step(model, data, 1500)
+    spec.delete(spec.equalities[0])
+    parts = ("shoulder", "upperarm", "elbow", "forearm", "wrist")
+    add_motors(spec, {"position": {f"robot0:{part}*": 300.0 for part in parts}}, "fetch")
+    on = Terms(spec.compile())
+    block, target = np.array([1.27, 0.75, 0.425]), np.array([1.35, 0.75, 0.425])
+    return from_mjcf(
+        on.model,
+        horizon=1.0,
+        dt=0.02,
+        x_init=np.concatenate([data.qpos[:15], block, np.eye(4)[0], np.zeros(model.nv)]),
+        running_residual=on.velocity(weight=1e-3),
+        terminal_residual=on.site("object0", target, weight=1e3) + on.velocity(weight=0.1),
+        contacts=[("robot0:*_gripper_finger_link", "object0"), ("object0", "table0")],
+        goal=lambda data: np.linalg.norm(data.site("object0").xpos - target) < 0.03,
+    )
+
+
+def hand(path: Path) -> Problem:
+    """Turns the cube on its palm by 90 degrees about the vertical."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.delete(spec.body("target"))  # which shows what is wanted
+    on = Terms(spec.compile())
+    data, turned = mujoco.MjData(on.model), np.empty(4)
+    mujoco.mj_step(on.model, data, 500)  # the cube falls onto the palm
+    place, quarter = data.body("object").xpos.copy(), np.array([1.0, 0.0, 0.0, 1.0]) / 2**0.5
+    mujoco.mju_mulQuat(turned, quarter, data.body("object").xquat)
+
+    def there(data: mujoco.MjData) -> bool:
+        off = np.linalg.norm(data.body("object").xpos - place)
+        cosines = np.sum(_axes(turned) * data.body("object").xmat.reshape(3, 3), axis=0)
+        return bool(off < 0.04 and cosines.min() > 0.9)
+
+    return from_mjcf(
+        on.model,
+        horizon=2.0,
+        dt=0.02,
+        x_init=np.concatenate([data.qpos, np.zeros(on.model.nv)]),
+        running_residual=on.velocity(weight=1e-3),
+        terminal_residual=on.body("object", place, turned, weight=[300.0] * 3 + [30.0] * 3),
+        contacts=[("robot0:C_*", "object")],
+        goal=there,
+    )
 
 
 PANDA = (0.0, 0.2, 0.0, -2.2, 0.0, 2.4, 0.8)
@@ -196,11 +253,14 @@ IIWA = (0.0, 0.65, 0.0, -1.6, 0.0, 0.8, 0.0)
 GO1 = {"_thigh_joint": 0.9, "_calf_joint": -1.8}
 SPOT = {"_hy_leg_joint": 0.8, "_kn_leg_joint": -1.6}
 G1 = {"_hip_pitch_joint": -0.31, "_knee_joint": 0.67, "_ankle_pitch_joint": -0.36}
+H1 = {"_hip_pitch": -0.4, "_knee": 0.8, "_ankle": -0.4}
 
 _ARMS, _LEGS = "robosuite/models/assets/robots", "mjlab/asset_zoo/robots"
+_GYM = "gymnasium_robotics/envs/assets"
 _go1 = partial(legs, GO1, "*_foot_collision", actuators={"position": 60.0})
 _spot = partial(legs, SPOT, "[FR][LR]")
 _g1 = partial(legs, G1, "*_foot*_collision", actuators={"position": 200.0})
+_h1 = partial(legs, H1, "*_ankle_link")
 
 TASKS: dict[str, tuple[str, Callable[[Path], Problem]]] = {
     "double_cart_pole": ("hydrax/models/double_cart_pole/scene.xml", double_cart_pole),
@@ -214,8 +274,14 @@ TASKS: dict[str, tuple[str, Callable[[Path], Problem]]] = {
     "go1_forward": (f"{_LEGS}/unitree_go1/xmls/go1.xml", partial(_go1, forward=0.3)),
     "spot_stand": (f"{_ARMS}/spot/robot.xml", _spot),
     "spot_forward": (f"{_ARMS}/spot/robot.xml", partial(_spot, forward=0.3)),
-    "g1_stand": (f"{_LEGS}/unitree_g1/xmls/g1.xml", _g1),
-    "g1_squat": (f"{_LEGS}/unitree_g1/xmls/g1.xml", partial(_g1, bend=1.8)),
+    "g1_stand_up": (f"{_LEGS}/unitree_g1/xmls/g1.xml", partial(_g1, bends=(1.8, 1.0))),
+    "g1_squat": (f"{_LEGS}/unitree_g1/xmls/g1.xml", partial(_g1, bends=(1.0, 1.8))),
+    "g1_step": (f"{_LEGS}/unitree_g1/xmls/g1.xml", partial(_g1, forward=0.2)),
+    "h1_stand_up": ("mujoco_menagerie/unitree_h1/h1.xml", partial(_h1, bends=(1.8, 1.0))),
+    "h1_squat": ("mujoco_menagerie/unitree_h1/h1.xml", partial(_h1, bends=(1.0, 1.8))),
+    "h1_step": ("mujoco_menagerie/unitree_h1/h1.xml", partial(_h1, forward=0.2)),
+    "fetch_push": (f"{_GYM}/fetch/push.xml", fetch),
+    "hand_turn": (f"{_GYM}/hand/manipulate_block.xml", hand),
 }
 """The file of each task, by its path from the package's name on, and what makes the problem."""
 
