@@ -77,6 +77,7 @@ def test_leaves_have_the_names_of_their_fields_and_make_the_same_object_again():
     assert jax.tree.map(lambda leaf: 2 * leaf, node) == One(2.0, 2, (6.0, 8.0))
 
 
+@pytest.mark.slow
 def test_a_compiled_function_answers_for_each_of_many_classes():
     """With JAX's own decorator 13 to 17 of a hundred classes got another's answer."""
     answer = jax.jit(lambda node: node.number + 0.0 * node.x)

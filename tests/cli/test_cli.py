@@ -222,6 +222,7 @@ def test_settings_are_set_by_name(tmp_path, capsys):
     assert "at least 1" in error_of(capsys, *short.split(), "--set", "attempts=0")
 
 
+@pytest.mark.slow
 def test_the_log_is_printed(slider, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: slider)
     words = f"solve pendulum --no-video --log --out {tmp_path}".split()

@@ -96,6 +96,7 @@ def test_what_the_user_says_about_the_cache_of_jax_holds(tmp_path, setting, valu
     assert files_kept(tmp_path, **{setting: value.format(tmp_path)}) == 0
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     (tmp_path / "mjx_drax").touch()
     assert files_kept(tmp_path) == 0

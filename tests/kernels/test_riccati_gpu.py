@@ -82,6 +82,7 @@ def test_a_kernel_is_chosen_by_the_size_of_blocks():
     assert kernel(7, 4, np.float64) is kernel(65, 4) is kernel(8, 0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noisy", "ndx"), [(True, NDX), (False, NDX), (False, MAX_NDX + 1)])
 def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeypatch):
     """As on a GPU, but interpreted: chains within problems are one launch."""

@@ -200,6 +200,7 @@ def bent(x):
 bent.defjvp(lambda primals, tangents: (bent(*primals), 5.0 * tangents[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "function",
     [

@@ -177,6 +177,7 @@ def test_violation_is_the_largest_distance_outside():
     assert BOUNDS.violation(replace(z, x=z.x.at[2, 2].set(1e9))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preconditioner", [None, Identity()])
 def test_a_solve_never_violates_bounds_that_it_presses_against(preconditioner):
     dt, limit = 0.2, 0.7

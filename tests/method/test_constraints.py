@@ -294,6 +294,7 @@ def test_no_constraints_are_the_same_as_constraints_without_rows():
     assert np.abs(plain.trajectory.u).max() > 0.1
 
 
+@pytest.mark.slow
 def test_numbers_of_constraints_change_without_recompiling():
     before, ends = iterate.iterate._cache_size(), []
     for limit, target in ((0.7, TARGET), (0.4, TARGET), (0.7, 2 * TARGET)):
@@ -304,6 +305,7 @@ def test_numbers_of_constraints_change_without_recompiling():
     assert not np.array_equal(ends[0], ends[2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounds", [Projection()])
 def test_gauss_newton_keeps_inequalities_whatever_the_bounds(bounds):
     # min 1/2 (x - 2)^2 s.t. x <= 1

@@ -125,6 +125,7 @@ class Kinked(FunctionDynamics):
     state_damping = 0.01
 
 
+@pytest.mark.slow
 def test_states_are_damped_less_where_f_has_kinks():
     """A full step is -(H + mu J'J + delta D)^-1 grad; another number does not recompile."""
     quiet, problem, delta, mu = Langevin(noise=Constant(0.0)), program(), 0.3, 5.0
@@ -153,6 +154,7 @@ def test_states_are_damped_less_where_f_has_kinks():
     assert compiled[1] == compiled[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noisy", [0, 2])
 def test_the_loop_that_diagnoses_does_what_the_loop_and_a_diagnosis_do(noisy):
     problem = program()
@@ -298,6 +300,7 @@ def test_a_chain_that_overflows_is_frozen_at_finite_knots():
     assert np.isfinite(z(state)).all()
 
 
+@pytest.mark.slow
 def test_numbers_change_without_recompiling():
     traced = []
 

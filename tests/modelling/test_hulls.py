@@ -147,6 +147,7 @@ def test_hulls_have_few_vertices_and_hold_all_others():
     assert float(hull("stone").excess) < 1e-6
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_values():
     with jax.enable_x64(True):
         made, h = hull("stone"), 1e-6

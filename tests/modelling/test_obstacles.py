@@ -105,6 +105,7 @@ def test_boxes_in_space_against_their_own_frame():
     close(SHAPES["box in space"](p), np.where(outside > 0, outside, -inside))
 
 
+@pytest.mark.slow
 @each
 def test_derivatives_are_those_of_the_values(name):
     """First and second, in float64, against central differences; reverse mode agrees."""
@@ -170,6 +171,7 @@ def test_grids_are_exact_at_their_values_and_smooth_between():
             close(before, after, 1e-6)
 
 
+@pytest.mark.slow
 def test_linear_grids_are_exact_and_far_points_lie_farther():
     x, y = np.meshgrid(0.5 * np.arange(5), 0.5 * np.arange(4), indexing="ij")
     plane = obstacles.grid(0.6 * x - 0.8 * y + 0.1, 0.5, [0, 0])
@@ -205,6 +207,7 @@ def test_images_are_upright_and_near_the_true_distance(tmp_path):
         assert error.mean() < 0.001
 
 
+@pytest.mark.slow
 def test_clearances_keep_the_order_and_stack():
     kinds = ("circle", "box", "polygon", "square", "capsule", "flat box")
     listed = [SHAPES[kind] for kind in kinds]

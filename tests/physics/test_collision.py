@@ -82,7 +82,10 @@ def meeting(kind, other, margin=0.0):
 
 
 def approached(model, count, depth, seed=0):
-    """Data of the C engine with geoms in random poses that overlap by up to `depth` [m], or are apart."""
+    """Data of the C engine with geoms in random poses that overlap by up to `depth` [m].
+
+    With a negative depth they are apart.
+    """
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     for _ in range(count):
         direction = rng.normal(size=3)

@@ -66,6 +66,7 @@ def test_q_and_minus_q_are_the_same_orientation():
     np.testing.assert_allclose(JOINTS.difference(x, y), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_derivatives_at_no_difference_are_the_identity(derivative):
     x, _ = drawn(0)

@@ -375,6 +375,7 @@ def test_bounds_of_quaternions_are_refused(side):
         problem(arm(world=BALL), x_bounds=tuple(ends))
 
 
+@pytest.mark.slow
 def test_quaternions_of_x_init_have_length_1():
     x = np.zeros(12)
     with pytest.raises(DraxError, match=r"x_init holds the quaternion .* at 2: scale it"):

@@ -90,6 +90,7 @@ def test_one_function_is_cost_and_goal_and_its_derivative_is_that_of_the_array()
     assert problem.reached(np.asarray(x, float)) is True
 
 
+@pytest.mark.slow
 def test_knots_in_a_batch_are_read_along_the_last_axes():
     problem = toy()
     x, u = (jnp.stack([a, 2 * a]) for a in drawn(problem))

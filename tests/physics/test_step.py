@@ -269,6 +269,7 @@ def test_the_nearest_contacts_are_enough_where_no_more_act():
     assert_steps_like_the_c_engine(model, states, contacts=2)
 
 
+@pytest.mark.slow
 def test_contacts_that_act_and_are_left_out_are_told():
     """The plan lets a ball fall through the floor that the C engine keeps it on."""
     model = mujoco.MjModel.from_xml_string(BALLS)
@@ -314,6 +315,7 @@ def test_smoothed_derivatives_feel_a_contact_from_afar():
     assert felt[1] < -0.1
 
 
+@pytest.mark.slow
 def test_float64_has_the_c_engines_numbers_and_changed_ones():
     """A problem built in float32 steps as the C engine does; a mass that was changed stays."""
     problem = from_mjcf(SWINGING, horizon=0.1, terminal_residual=lambda data: data.qpos)

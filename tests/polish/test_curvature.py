@@ -112,6 +112,7 @@ def learned(problem, steps):
     return secant, found.cost, exact
 
 
+@pytest.mark.slow
 def test_stages_learn_the_curvature_of_a_quadratic_lagrangian_in_as_many_steps_as_numbers():
     """The cost's Hessian is known; that of dynamics and constraints, constant here, is learned."""
     problem = posed(quadratic, running_residual=lambda x, u: jnp.concatenate([x, u]))

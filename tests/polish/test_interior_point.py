@@ -52,6 +52,7 @@ def test_one_guess_is_enough_in_float64(name):
         assert cost == pytest.approx(known[name], rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("van_der_pol", marks=pytest.mark.slow), "hs071"])
 def test_float32_reaches_its_tolerance(name):
     state, info = polished(*suite.posed(name), Polish(1e-4, 60))
@@ -120,6 +121,7 @@ def test_the_path_does_not_depend_on_the_units_of_the_cost(factor):
     np.testing.assert_allclose(scaled.trajectory.u, usual.trajectory.u, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize(
     "impossible",
@@ -165,6 +167,7 @@ def test_without_enough_iterations_a_chain_is_neither_optimal_nor_stalled():
     assert info.residual > 1e-8
 
 
+@pytest.mark.slow
 def test_a_projected_chain_has_no_defects_and_keeps_its_controls_in_bounds():
     problem = swing()
     knots = straight(problem, None)

@@ -103,6 +103,7 @@ def test_the_residual_has_no_units(change):
     np.testing.assert_allclose(parts_of(*somewhere(everything(**change), **units)), usual, 1e-9)
 
 
+@pytest.mark.slow
 def test_defects_and_constraints_are_told_apart():
     usual = parts_of(*somewhere(everything()))
     off = parts_of(*somewhere(everything(offset=50.0)))

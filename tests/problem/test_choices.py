@@ -176,6 +176,7 @@ def test_a_parameter_is_chosen_once():
     assert names == ["x0", "x1", "speed_0", "speed_1", "unused"]
 
 
+@pytest.mark.slow
 def test_the_c_engine_replays_the_changed_model_at_its_own_step():
     problem = robot(
         horizon=(0.05, 0.2),

@@ -120,6 +120,7 @@ def constrained():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("by", "atol"),
     [(Autodiff(), 1e-10), pytest.param(Smoothed(64, 1e-4), 1e-4, marks=pytest.mark.slow)],

@@ -76,6 +76,7 @@ def test_knots_are_scattered_inside_one_sided_bounds(bounds, scatter):
     assert (float(box.u_lower[0]), float(box.u_upper[0])) == scatter
 
 
+@pytest.mark.slow
 def test_lbfgs_is_a_method_of_multipliers():
     # min (a - 1)^2 + 10 (b - a^2)^2  s.t.  a + b = 1: eliminate b and set the derivative to zero.
     slope = np.polyder(np.polyadd([1, -2, 1], 10 * np.polymul([-1, -1, 1], [-1, -1, 1])))

@@ -336,6 +336,7 @@ def test_another_question_is_refused(written, changes, words):
     assert written.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_names_and_goals_are_no_part_of_the_question(written, whole):
     other = problem(goal=lambda x: False, name="other")
     again = solved(problem=other, checkpoint=written)

@@ -90,6 +90,7 @@ def test_the_worst_chains_get_most_places():
     np.testing.assert_array_equal(_owners(done, cost), [2, 3, 0, 2])
 
 
+@pytest.mark.slow
 def test_chains_that_are_done_are_left_alone():
     first = minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=1))
     second = minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=2))
@@ -117,6 +118,7 @@ def test_attempts_share_one_compilation():
     assert iterate._cache_size() - before == 1
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
     def interrupt(done, total, info):
         if done > 120:
@@ -301,6 +303,7 @@ def test_each_problem_of_a_batch_has_its_own_rollouts(balls):
     np.testing.assert_array_equal(split.chain_cost, found.chain_cost)
 
 
+@pytest.mark.slow
 def test_interrupted_between_rollouts_keeps_what_there_is(balls):
     def stop(done, total, info):
         if done > 170:  # the attempt took 160

@@ -69,6 +69,7 @@ def test_the_scale_goes_with_the_cost_and_not_with_units_of_states():
     assert measured(unit=UNIT)[0] == pytest.approx(scale, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_heavy_end_counts_no_more_than_controls_where_there_is_a_polish():
     heavy, heavier = (measured(terminal=w)[0] for w in (1e4, 1e6))
     assert heavier == pytest.approx(heavy, rel=1e-3)

@@ -56,6 +56,7 @@ def test_a_longer_horizon_begins_with_the_old_motion(cold):
     np.testing.assert_allclose(warm.cost, solve(longer, chains=2).cost, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_no_chain_ends_worse_than_its_guess(cold):
     hasty = replace(Restarts(), attempts=1, descent=3, polish=Polish(iterations=2))
     worst = solve(limited(), chains=4, solver=hasty)

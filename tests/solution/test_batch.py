@@ -148,6 +148,7 @@ def test_ctrl_c_keeps_what_there_is(whole, chunks):
     assert (found.max_defect[~solved] == np.inf).all()
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
     done = []
 

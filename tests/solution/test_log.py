@@ -38,6 +38,7 @@ def test_a_history_without_residuals_has_dashes():
     assert [line.split()[-1] for line in table(older, 1e-4).splitlines()[2:]] == ["0"] * 3
 
 
+@pytest.mark.slow
 def test_programs_have_a_log_too():
     program = from_program(2, cost=lambda x: (x[0] - 1) ** 2 + (x[1] - x[0] ** 2) ** 2)
     found = minimize(program, chains=4)

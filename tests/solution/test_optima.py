@@ -282,6 +282,7 @@ def test_table_tells_cost_share_and_replays(hill):
     assert " ".join(optima_lines(lost)[1].split()[3:]) == "fails reaches goal -"
 
 
+@pytest.mark.slow
 def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
     seen = []
 
@@ -303,6 +304,7 @@ def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
     plot_optima(many, tmp_path / "many.png")
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_picture_only_of_several(tmp_path, capsys, monkeypatch, hill):
     monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: hill)
     arguments = f"solve pendulum --no-video --out {tmp_path}".split()

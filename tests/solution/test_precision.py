@@ -114,6 +114,7 @@ def test_a_guess_and_another_attempt_stay_in_float64(problem):
     assert found.residual.max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_model_reaches_1e_8(rail, tmp_path):
     problem, solution = rail
     assert solution.tolerance == 1e-8

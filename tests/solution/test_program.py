@@ -84,6 +84,7 @@ def test_a_residual_is_half_its_square(linear):
         assert program.max_defect(at) == pytest.approx(np.abs(A @ x - b).max())
 
 
+@pytest.mark.slow
 def test_without_noise_the_papers_flow_is_the_differential_multiplier_method(linear):
     x, multipliers = np.array([1.0, -1.0, 2.0]), np.zeros(2)
     knots = Trajectory(jnp.zeros((1, 1, 0)), jnp.asarray(x)[None, None])
@@ -132,6 +133,7 @@ def hs071():
     }
 
 
+@pytest.mark.slow
 def test_hs071_and_its_multipliers_are_those_of_the_book_and_of_scipy():
     parts = hs071()
     program = from_program(4, **parts, bounds=(1.0, 5.0))

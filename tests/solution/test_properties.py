@@ -48,6 +48,7 @@ def content(solution):
     return said, {name: (a.dtype, a.shape, np.asarray(a).tobytes()) for name, a in arrays.items()}
 
 
+@pytest.mark.slow
 @bounded
 @given(data=st.data())
 def test_damaged_files_load_as_they_were_or_not_at_all(saved, data):

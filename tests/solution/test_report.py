@@ -82,6 +82,7 @@ def test_worst_refuses_what_is_no_chain_and_a_lost_problem(tmp_path):
         Solution.load(made.save(tmp_path)).worst()
 
 
+@pytest.mark.slow
 def test_a_minimum_is_shown_with_its_cost_and_what_it_breaks():
     program = from_program(2, cost=lambda z: z @ z, equality=lambda z: z[:1] - 1.0, name="square")
     found = minimize(program, chains=2, solver=Restarts(descent=20, attempts=1))

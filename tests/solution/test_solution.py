@@ -241,6 +241,7 @@ def test_what_blows_up_in_the_c_engine_is_no_success(control, tmp_path, monkeypa
 # Solves.
 
 
+@pytest.mark.slow
 def test_gains_come_even_where_the_preconditioner_factorizes_nothing():
     solver = replace(QUICK, preconditioner=Identity(), step_size=1e-3)
     solution = solve(reach(), chains=3, solver=solver)
@@ -353,6 +354,7 @@ def test_a_cost_or_dynamics_that_are_nan_everywhere_are_refused(no_compilation):
             solve(reach(**part), chains=3, solver=QUICK)
 
 
+@pytest.mark.slow
 def test_a_models_cost_that_is_nan_everywhere_is_refused(no_compilation):
     for cost, words in (
         (
@@ -464,6 +466,7 @@ def of_no_module():
     return f
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "f", [in_closure(), Plant().step, of_no_module()], ids=["closure", "method", "no module"]
 )

@@ -249,6 +249,7 @@ def test_an_infeasible_plan_says_where_it_breaks_the_dynamics(tmp_path):
     assert again.where(0).told(again.problem).startswith("breaks the dynamics by 1.0e+00")
 
 
+@pytest.mark.slow
 def test_an_infeasible_plan_says_which_constraint_it_breaks():
     problem = point(inequality=lambda x, u: jnp.array([x[0] - 1.0, u[0] - 0.1]))
     guess = Trajectory(np.zeros((K, 2)), np.where(np.arange(K) == 4, 0.8, 0.0)[:, None] * [1, 0])
@@ -329,6 +330,7 @@ def test_the_replay_that_succeeds_and_is_cheaper_speaks_for_a_chain():
     assert made.optima[0].cost == 1.0
 
 
+@pytest.mark.slow
 def test_tolerances_come_back_and_can_be_changed(tmp_path):
     problem = point(inequality=lambda x, u: u - 0.4)
     solver = Langevin(iterations=10, tail=20)
@@ -342,6 +344,7 @@ def test_tolerances_come_back_and_can_be_changed(tmp_path):
     assert strict.feedback.success.sum() <= found.feedback.success.sum()
 
 
+@pytest.mark.slow
 def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
     def limited(limit):
         return mass(

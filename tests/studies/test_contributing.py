@@ -160,6 +160,7 @@ def test_a_solution_says_which_module_it_needs(mine, tmp_path):
         sys.modules[MODULE] = module
 
 
+@pytest.mark.slow
 def test_the_metrics_drift_and_noise_are_those_of_its_matrix(mine):
     problem, metric, flow = cart(), mine.Stiff(control=5.0), Langevin()
     knots = flow.inside(problem, problem.draw(jax.random.key(0)))

@@ -124,6 +124,7 @@ def test_the_cycloid_ends_at_10_and_5():
     assert open_problems.cycloid() == pytest.approx(1.8012955)
 
 
+@pytest.mark.slow
 def test_straight_lines_lead_to_the_end_with_unit_quaternions():
     problem = tasks.load("quadrotor").make()
     x = np.asarray(straight(problem, suite.TASKS["quadrotor"]).x)
@@ -187,6 +188,7 @@ def opened():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("make", [short, pytest.param(opened, marks=pytest.mark.slow)])
 def test_ipopt_gets_the_derivatives_of_the_whole_program(make):
@@ -255,6 +257,7 @@ def _marks(name):
     return [worse] if name == "tracking" else [worse, pytest.mark.slow]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("name", [pytest.param(name, marks=_marks(name)) for name in OPEN])
 def test_open_problems_end_at_their_published_optima(name):

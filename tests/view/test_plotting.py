@@ -94,6 +94,7 @@ def test_more_curves_than_colors_are_split() -> None:
     assert sorted(label for part in parts for label in part.labels) == sorted(labels)
 
 
+@pytest.mark.slow
 def test_one_chain(tmp_path: Path) -> None:
     solver = Langevin(iterations=2, tail=0)
     one = solve(load("pendulum").make(), chains=1, solver=solver)

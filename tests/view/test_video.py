@@ -464,6 +464,7 @@ def test_drawing_leaves_the_environment_alone() -> None:
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_missing_libraries_of_a_chosen_backend_are_named(tmp_path: Path) -> None:
     # With MUJOCO_GL=egl and no libEGL, `import mujoco` fails as this stand-in does.
     complaint = "'NoneType' object has no attribute 'eglQueryString'"
