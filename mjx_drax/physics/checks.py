@@ -38,8 +38,10 @@ from mjx_drax.physics.states import Engine, integrate, quiet, set_state
 SINGULAR = 1e-10
 """Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
 
-WRONG, NOTICEABLE = 1e-2, 1e-6
-"""One-step errors of velocities [rad/s, m/s] above which a model is refused, or warned of."""
+WORST, WRONG, NOTICEABLE = 1e-1, 1e-2, 1e-6
+"""One-step errors of velocities [rad/s, m/s] above which a model is refused, if there is one such
+state, or if most states are so, or is warned of. Here and there a body lies on another with one
+contact more in the C engine, and the certificate says whether that matters."""
 
 MOMENTS = (0.05, 0.2, 0.6)
 """Times [s] of the states that the engines are compared at, along a motion from x_init."""
@@ -399,7 +401,8 @@ def _examined(
             f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
             f"{name}: {cause}."
         )
-        if not error <= WRONG:
+        usual = float(np.median(errors.velocity))
+        if not (usual <= WRONG and error <= WORST):
             obstacle = words
         else:
             notes.append(words)

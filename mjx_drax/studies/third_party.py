@@ -4,7 +4,8 @@
                                            [--timeout S] [--out DIR]
 
 Each is either solved (`postures.reach`, default settings) or refused with a reason; a Markdown
-table says which, and another one counts the reasons. Models without actuators get motors. Models
+table says which, and another one counts the reasons. With `--chains 0` nothing is solved: the table
+says which models are usable, whose steps are the C engine's. Models without actuators get motors. Models
 come from `pip install "mjx-drax[third-party]"`, from other packages of `FOLDERS`, or from any
 folder, such as a checkout of MuJoCo Menagerie; only their files are read, and nothing of the
 packages is imported. Every model gets a process of its own, with a time limit.
@@ -98,7 +99,8 @@ def measure(name: str, path: Path, chains: int = 16, seed: int = 0) -> Row:
         if host.nv and not host.nu:
             host = load(path, "torque")
         row |= {"nq": host.nq, "nv": host.nv, "nu": host.nu}
-        return row | solved(reach(host, seed, name=name), chains, seed)
+        problem = reach(host, seed, name=name)
+        return row | (solved(problem, chains, seed) if chains else {"usable": True})
     except DraxError as error:
         return row | {"refused": str(error)}
 
@@ -157,7 +159,7 @@ def line(row: Row) -> str:
     sizes = "/".join(cell(key) for key in ("nq", "nv", "nu"))
     reason = row.get("refused") or row.get("failed")
     if reason is None:
-        reason = "" if row["certified"] else "not certified"
+        reason = "" if row.get("usable") or row["certified"] else "not certified"
     words = " ".join(reason.replace("|", "\\|").split())
     return (
         f"| {row['model']} | {sizes} | {cell('rows')} | {cell('knots')} | {words} "
@@ -176,8 +178,13 @@ def causes(rows: Sequence[Row]) -> str:
             known = (cause for part, cause in CAUSES.items() if part in words)
             counts.setdefault(next(known, "other"), []).append(row["model"])
     order = sorted(counts.items(), key=lambda entry: -len(entry[1]))
-    lines = [f"| {cause} | {len(names)} | {names[0]} |" for cause, names in order]
+    order.insert(0, ("none: usable", [row["model"] for row in rows if _is_usable(row)]))
+    lines = [f"| {cause} | {len(names)} | {names[0]} |" for cause, names in order if names]
     return "\n".join(["| cause | models | such as |\n|---|---|---|", *lines])
+
+
+def _is_usable(row: Row) -> bool:
+    return not (row.get("refused") or row.get("failed"))
 
 
 def told(measured: Iterable[Row], out: Path | None) -> list[Row]:
@@ -194,7 +201,7 @@ def told(measured: Iterable[Row], out: Path | None) -> list[Row]:
 
 def fine(row: Row) -> bool:
     """Whether the model was solved, or refused with a reason."""
-    return bool(row.get("certified") or row.get("refused"))
+    return bool(row.get("certified") or row.get("usable") or row.get("refused"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -204,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="default: all that are installed")
     parser.add_argument("--path", type=Path, metavar="DIR", help="models of a folder instead")
-    parser.add_argument("--chains", type=int, default=16)
+    parser.add_argument("--chains", type=int, default=16, help="0: only look which are usable")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--timeout", type=float, default=600.0, metavar="SECONDS")
     parser.add_argument("--out", metavar="DIR", help="where third_party.json goes")
