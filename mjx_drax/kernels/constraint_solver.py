@@ -57,8 +57,8 @@ MOST_DOFS, MOST_ROWS = 64, 128
 class Constraints(NamedTuple):
     """M (nv, nv), J (m, nv), D and aref (m,), a0 (nv,).
 
-    D y is clipped to D lower and D upper, (m,): 0 and infinity of what pulls or pushes to both
-    sides; -infinity and 0 of a contact or a limit, which only pushes.
+    s'(y) = D clip(y, lower, upper), all (m,). What holds to both sides has no bounds; contacts and
+    limits, which only push, have upper = 0; dry friction has the y at which it slides.
     """
 
     M: Array
