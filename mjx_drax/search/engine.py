@@ -351,9 +351,7 @@ class Search:
         todo = np.flatnonzero(unfinished > (1.0 - settings.enough) * self.chains)
         if stage.attempt + 1 == settings.attempts or not len(todo):
             return False
-        scale = stage.cost_scale.copy()
-        feasible = kept.feasible.reshape(shape).mean(axis=1)
-        scale[feasible < FEW] *= STRICTER  # the knots' cost says too little: penalize defects more
+        scale = stricter(stage.cost_scale, kept.feasible.reshape(shape))
         self.stage = replace(stage, attempt=stage.attempt + 1, cost_scale=scale, todo=todo, place=0)
         return True
 
@@ -734,6 +732,14 @@ def _owners(done: np.ndarray, cost: np.ndarray) -> np.ndarray:
     """For which chain each place works: those that are not done, the worst first, (chains,)."""
     worst_first = np.argsort(-cost, kind="stable")
     return np.resize(worst_first[~done[worst_first]] if not done.all() else [0], len(done))
+
+
+def stricter(cost_scale: np.ndarray, feasible: np.ndarray) -> np.ndarray:
+    """Scales of costs for a further attempt, (n,), from those so far and which chains are feasible.
+
+    Where few are, the cost of the initial knots says too little: defects are penalized more.
+    """
+    return np.where(feasible.mean(axis=1) < FEW, STRICTER * cost_scale, cost_scale)
 
 
 def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: float) -> float:

@@ -26,7 +26,7 @@ from mjx_drax import (
 )
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
-from mjx_drax.search.engine import Chains, Search, _owners, best_of
+from mjx_drax.search.engine import Chains, Search, _owners, best_of, stricter
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, begin, iterate, partition, restart_at
@@ -88,6 +88,11 @@ def test_beyond_enough_every_chain_is_tried_again():
 def test_the_worst_chains_get_most_places():
     done, cost = np.array([False, True, False, False]), np.array([2.0, 1.0, np.inf, 5.0])
     np.testing.assert_array_equal(_owners(done, cost), [2, 3, 0, 2])
+
+
+def test_defects_are_penalized_more_where_few_chains_are_feasible():
+    feasible = np.array([[True, False, False, False], [True, True, False, False]])
+    np.testing.assert_array_equal(stricter(np.array([2.0, 3.0]), feasible), [20.0, 3.0])
 
 
 @pytest.mark.slow
