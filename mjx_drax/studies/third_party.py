@@ -5,10 +5,10 @@
 
 Each is either solved (`postures.reach`, default settings) or refused with a reason; a Markdown
 table says which, and another one counts the reasons. With `--chains 0` nothing is solved: the table
-says which models are usable, whose steps are the C engine's. Models without actuators get motors. Models
-come from `pip install "mjx-drax[third-party]"`, from other packages of `FOLDERS`, or from any
-folder, such as a checkout of MuJoCo Menagerie; only their files are read, and nothing of the
-packages is imported. Every model gets a process of its own, with a time limit.
+says which models are usable, because their steps are those of the C engine. Models without
+actuators get motors. Models come from `pip install "mjx-drax[third-party]"`, from other packages of
+`FOLDERS`, or from any folder, such as a checkout of MuJoCo Menagerie; only their files are read,
+and nothing of the packages is imported. Every model gets a process of its own, with a time limit.
 """
 
 from __future__ import annotations
