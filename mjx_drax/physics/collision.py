@@ -326,7 +326,7 @@ def _hull(kind: int, size: Array) -> ConvexMesh:
     """The hull that stands for a geom of a size (3,)."""
     # Constants of its own for each precision: JAX may take one for the other
     unit = jax.tree.map(lambda array: jnp.asarray(array, size.dtype), _unit_hull(kind))
-    unit = unit.replace(edge=_unit_hull(kind).edge)
+    unit = unit.replace(edge=_unit_hull(kind).edge.astype(np.int32))
     scale = size[jnp.array([0, 0, 1])] if kind == CYLINDER else size
 
     def turned(normals: Array) -> Array:
