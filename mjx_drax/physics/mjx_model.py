@@ -211,7 +211,11 @@ def unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
     body = (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
     refused = np.isin(between, [int(kind) for kind in body]).any(axis=1)
     refused |= model.sensor_intprm[:, 1] == _NET_FORCE
-    return unknown | refused & (model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
+    unknown |= refused & (model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
+    touch = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_TOUCH))
+    cylinders = model.site_type[model.sensor_objid[touch]] == int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+    unknown[touch[cylinders]] = True
+    return unknown
 
 
 def _refusal(model: mujoco.MjModel, without: set[Pair], reason: str) -> str:

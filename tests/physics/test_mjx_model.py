@@ -24,7 +24,7 @@ from mjx_drax.physics.mjx_model import (
 from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.pairs import contact_pairs
 from mjx_drax.physics.states import Engine
-from mjx_drax.physics.step import data_at, step
+from mjx_drax.physics.step import data_at, forward, step
 from mjx_drax.physics.stepper import Stepper
 
 CHAIN = """
@@ -257,6 +257,17 @@ def test_contact_sensors_that_mjx_refuses_are_left_out(contact):
     model = chain(more=TOUCH.format(f'contact name="odd" {contact}'))
     assert set_aside(model) == ["sensor 'odd' is unknown to MJX: a cost cannot read it"]
     assert put_model(model).nsensor == 1
+
+
+def test_a_touch_sensor_in_a_cylinder_is_left_out():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .1"><freejoint/>
+        <geom size=".1"/><site name="tip" type="cylinder" size=".1 .1"/></body></worldbody>
+        <sensor><touch name="odd" site="tip"/></sensor></mujoco>"""
+    )
+    assert set_aside(model) == ["sensor 'odd' is unknown to MJX: a cost cannot read it"]
+    on_device = put_model(model)
+    assert jax.eval_shape(partial(forward, on_device), jnp.zeros(13), jnp.zeros(0)) is not None
 
 
 def test_a_cost_that_reads_an_unknown_sensor_is_refused():
