@@ -34,7 +34,6 @@ from mjx_drax.kernels.batching import (
 from mjx_drax.kernels.linalg import cholesky, solve, symmetric
 from mjx_drax.kernels.riccati_blocks import (
     SPLIT,
-    WARPS,
     padded,
     product,
     swept,
@@ -52,6 +51,10 @@ float32, or where constraints are about to switch, costs go on decreasing by alm
 
 MOST_DOFS, MOST_ROWS = 64, 128
 """Largest M and J of the kernel."""
+
+MOST_OF_ONE_WARP = 64
+"""Rows of J up to which one warp of 32 threads works on a row: no threads wait for others. Four do
+for more, which the registers of one do not hold."""
 
 
 class Constraints(NamedTuple):
@@ -185,7 +188,8 @@ def minima(given: Constraints, interpret: bool = False) -> Array:
     arrays = [padded(a, *shape) for a, shape in zip(given, shapes, strict=True)]
     precision = lax.Precision.HIGHEST if interpret else SPLIT
     body = partial(_body, n, partial(product, precision=precision))
-    found = block_for_each_row(body, {"a": (len(arrays[0]), N)}, arrays, WARPS, interpret)
+    warps = 1 if M <= MOST_OF_ONE_WARP else 4
+    found = block_for_each_row(body, {"a": (len(arrays[0]), N)}, arrays, warps, interpret)
     return found["a"][:, :n]
 
 

@@ -158,13 +158,17 @@ def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
 
 
 def _constrained(
-    model: mjx.Model, data: mjx.Data, solution: tuple[Array, Array] | None = None
+    model: mjx.Model,
+    data: mjx.Data,
+    solution: tuple[Array, Array] | None = None,
+    derivatives: bool = True,
 ) -> mjx.Data:
     """`data` with the acceleration and the forces under constraints, and with derivatives."""
     if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
-    found, factor = solution or _solution(model, data)
-    qacc = found - solve(factor, _law(model, data, found)[0])
+    qacc, factor = solution or _solution(model, data)
+    if derivatives:
+        qacc = qacc - solve(factor, _law(model, data, qacc)[0])
     _, forces = _law(model, data, qacc)
     data = data.replace(qacc=qacc, qfrc_constraint=forces.Ma - data.qfrc_smooth)
     return with_internal(data, efc_force=forces.efc_force)
@@ -221,14 +225,14 @@ def _rates(model: mjx.Model, x: Array, u: Array) -> Array:
     return (_with_own_derivative if has_constraints(model) else _rates_of)(model, x, u)
 
 
-def _rates_of(model: mjx.Model, x: Array, u: Array) -> Array:
-    """`_rates`, differentiated operation by operation."""
+def _rates_of(model: mjx.Model, x: Array, u: Array, derivatives: bool = True) -> Array:
+    """`_rates`, differentiated operation by operation, if at all."""
     data = _smooth(model, kinematics(model, data_at(model, x, u)))
-    data = _constrained(model, data)
+    data = _constrained(model, data, derivatives=derivatives)
     return jnp.concatenate([_implicit(model, data), _activation_rates(model, data)])
 
 
-_with_own_derivative = jax.custom_jvp(_rates_of)
+_with_own_derivative = jax.custom_jvp(partial(_rates_of, derivatives=False))
 
 
 @partial(_with_own_derivative.defjvp, symbolic_zeros=True)
