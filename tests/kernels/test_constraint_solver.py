@@ -52,6 +52,14 @@ def test_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian():
     np.testing.assert_allclose(seen, hessian, rtol=1e-4, atol=1e-3)
 
 
+def test_a_stiff_contact_early_on_the_way_does_not_end_the_search():
+    """Minimize 1/2 |a|^2 + 1/2 (a_1 - 1000)^2, where a_1 <= a_2 / 2 + 0.01, almost."""
+    rows = [jnp.array([[1.0, 0.0], [-1.0, 0.5]]), jnp.array([1.0, 1e6]), jnp.array([1e3, -0.01])]
+    bounds = jnp.full(2, -jnp.inf), jnp.zeros(2)
+    found, _ = constrained_minimum(Constraints(jnp.eye(2), *rows, *bounds, jnp.zeros(2)))
+    np.testing.assert_allclose(found, [1e3 / 6, 1e3 / 3], rtol=1e-3)
+
+
 def test_an_enormous_force_elsewhere_changes_nothing():
     given = drawn()
     apart = given._replace(
