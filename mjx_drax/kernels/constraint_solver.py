@@ -1,13 +1,14 @@
-"""Accelerations under constraints whose friction cones are pyramids: Newton's method, for each row.
+"""Accelerations under constraints: Newton's method, for each row.
 
 The acceleration a minimizes
 
     1/2 (a - a0)' M (a - a0) + sum_i s_i(J_i a - aref_i)
 
-where s_i'(y) is D y, clipped where a contact or a limit opens, y > 0, or where dry friction slides.
-The function is piecewise quadratic: once the constraints that are active stay the same, a full step
-ends at the minimum; before, a shorter one may be better. On GPUs one kernel does all iterations of
-a row, in a block of threads.
+where s_i'(y) is D y, clipped where a contact or a limit opens, y > 0, or where dry friction slides;
+`elliptic_cones` has the s of elliptic friction cones. Without these the function is piecewise
+quadratic: once the constraints that are active stay the same, a full step ends at the minimum;
+before, a shorter one may be better. On GPUs one kernel does all iterations of a row, in a block of
+threads.
 
 Forces may be larger than what they leave over by more digits than numbers have. So only changes of
 the function are computed, and M a0, which is the sum of all other forces, is never taken from M a.
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mjx_drax.kernels import elliptic_cones as elliptic
 from mjx_drax.kernels.batching import (
     block_for_each_row,
     merged_vmaps,
@@ -33,6 +35,7 @@ from mjx_drax.kernels.batching import (
 )
 from mjx_drax.kernels.linalg import cholesky, solve, symmetric
 from mjx_drax.kernels.riccati_blocks import (
+    LEAST,
     SPLIT,
     padded,
     product,
@@ -50,19 +53,20 @@ LEAST_SHARE = 1e-3
 another one to follow: in float32 costs go on decreasing by almost nothing. A step that meets a
 stiff contact on its way may be a small share of the whole, and others follow it."""
 
-MOST_DOFS, MOST_ROWS = 64, 128
-"""Largest M and J of the kernel."""
+MOST_DOFS, MOST_ROWS, MOST_IN_CONES = 64, 128, 64
+"""Largest M and J of the kernel, and J with elliptic cones, whose kernel compiles for longer."""
 
 MOST_OF_ONE_WARP = 64
 """Rows of J up to which one warp of 32 threads works on a row: no threads wait for others. Four do
-for more, which the registers of one do not hold."""
+for more, and with elliptic cones, for which the registers of one are too few."""
 
 
 class Constraints(NamedTuple):
     """M (nv, nv), J (m, nv), D and aref (m,), a0 (nv,).
 
     s'(y) = D clip(y, lower, upper), all (m,). What holds to both sides has no bounds; contacts and
-    limits, which only push, have upper = 0; dry friction has the y at which it slides.
+    limits, which only push, have upper = 0; dry friction has the y at which it slides. Rows of
+    elliptic friction cones have D = 0.
     """
 
     M: Array
@@ -72,20 +76,67 @@ class Constraints(NamedTuple):
     lower: Array
     upper: Array
     a0: Array
+    cones: elliptic.Cones | None = None
 
 
 def law(given: Constraints, y: Array) -> tuple[Array, Array]:
-    """-s'(y) and s''(y) of y = J a - aref, (..., m)."""
+    """-s'(y) and s''(y) of y = J a - aref, (..., m), without cones."""
     clipped = jnp.clip(y, given.lower, given.upper)
     return -given.D * clipped, jnp.where(clipped == y, given.D, 0.0)
 
 
 def changes(given: Constraints, y: Array, h: Array) -> tuple[Array, Array]:
-    """s(y + h) - s(y) - s'(y) h and s'(y + h) - s'(y), (..., m)."""
+    """s(y + h) - s(y) - s'(y) h and s'(y + h) - s'(y), (..., m), without cones."""
     later = y + h
     here, there = (jnp.clip(a, given.lower, given.upper) for a in (y, later))
     moved = jnp.where((here == y) & (there == later), h, there - here)
     return given.D * moved * (later - there + 0.5 * moved), given.D * moved
+
+
+def hessian(given: Constraints, y: Array, product: Callable[..., Array] = jnp.matmul) -> Array:
+    """M + J' s''(y) J, (nv, nv)."""
+    _, active = law(given, y)
+    bent = given.J * active[:, None]
+    if given.cones is not None:
+        at = elliptic.place(given.cones, _total(given.cones), y)
+        bent = bent + product(elliptic.curvature(given.cones, at), given.J)
+    return given.M + product(bent.T, given.J)
+
+
+def _total(cones: elliptic.Cones) -> elliptic.Total:
+    return partial(times, elliptic.together(cones))
+
+
+def _forces(
+    given: Constraints, total: elliptic.Total | None, y: Array
+) -> tuple[Array, Array, elliptic.Place | None]:
+    """-s'(y), what is the same as long as the same constraints are active, and where cones are."""
+    push, active = law(given, y)
+    if given.cones is None or total is None:
+        return push, active, None
+    at = elliptic.place(given.cones, total, y)
+    return push + elliptic.forces(given.cones, at), active + at.zone, at
+
+
+def _line(
+    given: Constraints,
+    total: elliptic.Total | None,
+    at: elliptic.Place | None,
+    y: Array,
+    h: Array,
+) -> Callable[[Array], tuple[Array, Array]]:
+    """size, (..., 1) or () -> `changes` from y to y + size h, with those of cones."""
+    cones = given.cones
+    if cones is None or total is None or at is None:
+        return lambda size: changes(given, y, size * h)
+    of_cones = partial(elliptic.changes, cones, at, elliptic.ray(cones, total, at, h))
+
+    def both(size: Array) -> tuple[Array, Array]:
+        pairs = zip(changes(given, y, size * h), of_cones(size), strict=True)
+        change, rise = (a + b for a, b in pairs)
+        return change, rise
+
+    return both
 
 
 def iterated(
@@ -100,30 +151,33 @@ def iterated(
     """
     M, J, a0 = given.M, given.J, given.a0
     eps, sizes = jnp.finfo(a0.dtype).eps, jnp.exp2(-lax.iota(jnp.int32, SIZES).astype(a0.dtype))
+    total = None if given.cones is None else _total(given.cones)
 
     def iteration(carry: Any) -> Any:
         count, _, *here, nothing, _ = carry
         _, rest, y = here
-        push, active = law(given, y)
+        push, active, at = _forces(given, total, y)
         pull = transposed_times(J, push)
         gradient = rest - pull
-        direction, left = newton(M + product((J * active[:, None]).T, J), gradient)
+        direction, left = newton(hessian(given, y, product), gradient)
         along = direction, times(M, direction), times(J, direction)
         first, second = jnp.sum(gradient * direction), jnp.sum(direction * along[1])
 
-        def tried(sizes: Array, h: Array) -> tuple[Array, Array]:
+        line = _line(given, total, at, y, -along[2])
+
+        def tried(sizes: Array, each: Array) -> tuple[Array, Array]:
             """Change of what is minimized by steps of these sizes, and its slope there."""
-            of_rows, rise = changes(given, y, h)
+            of_rows, rise = line(each)
             change = nothing + sizes * (0.5 * sizes * second - first) + jnp.sum(of_rows, axis=-1)
             return change, sizes * second - first - jnp.sum(rise * along[2], axis=-1)
 
-        change, slope = tried(sizes, -sizes[:, None] * along[2][None])
+        change, slope = tried(sizes, sizes[:, None])
         size, least = _level(sizes, slope, -first), jnp.min(change)
-        between, _ = tried(size, -size * along[2])
+        between, _ = tried(size, size)
         on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
         size, least = jnp.where(between < least, size, on_ladder), jnp.minimum(between, least)
         rounding = eps * jnp.sum(jnp.abs(direction) * (jnp.abs(rest) + jnp.abs(pull)))
-        _, later = law(given, y - along[2])
+        _, later, _ = _forces(given, total, y - along[2])
         same = jnp.max(jnp.abs(later - active)) == 0.0
         better = -least > jnp.maximum(rounding, jnp.where(same, LEAST_SHARE * first, 0.0))
         size = jnp.where(better, size, 0.0)
@@ -159,16 +213,16 @@ def _plain(given: Constraints) -> tuple[Array, Array]:
 
 def _factor(given: Constraints, a: Array) -> Array:
     """Of the Hessian at a."""
-    _, slope = law(given, times(given.J, a) - given.aref)
-    return cholesky(symmetric(given.M + (given.J * slope[:, None]).T @ given.J))
+    return cholesky(symmetric(hessian(given, times(given.J, a) - given.aref)))
 
 
 def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Array]:
     given = repeated(has_rows, given)
     rows, nv = given.J.shape[-2:]
-    fits = nv <= MOST_DOFS and rows <= MOST_ROWS and given.M.dtype == np.float32
+    most = MOST_ROWS if given.cones is None else MOST_IN_CONES
+    fits = nv <= MOST_DOFS and rows <= most and given.M.dtype == np.float32
     plain = jax.vmap(_plain)
-    if not (on_gpu() and fits and of_one_precision(given)):
+    if not (on_gpu() and fits and of_one_precision(jax.tree.leaves(given))):
         return plain(given)
 
     def kernel(given: Constraints) -> tuple[Array, Array]:
@@ -188,18 +242,23 @@ def minima(given: Constraints, interpret: bool = False) -> Array:
     m, n = given.J.shape[-2:]
     M, N = tile(m), tile(n)
     shapes = (N, N), (M, N), (M,), (M,), (M,), (M,), (N,)
-    arrays = [padded(a, *shape) for a, shape in zip(given, shapes, strict=True)]
+    arrays = [padded(a, *shape) for a, shape in zip(given[:-1], shapes, strict=True)]
+    arrays += [padded(a, M) for a in given.cones or ()]
     precision = lax.Precision.HIGHEST if interpret else SPLIT
     body = partial(_body, n, partial(product, precision=precision))
-    warps = 1 if M <= MOST_OF_ONE_WARP else 4
-    found = block_for_each_row(body, {"a": (len(arrays[0]), N)}, arrays, warps, interpret)
+    alone = M <= MOST_OF_ONE_WARP if given.cones is None else M == LEAST
+    found = block_for_each_row(
+        body, {"a": (len(arrays[0]), N)}, arrays, 1 if alone else 4, interpret
+    )
     return found["a"][:, :n]
 
 
 def _body(n: int, product: Callable[..., Array], *refs: Any) -> None:
     """One row."""
     *inputs, out = refs
-    given = Constraints(*(ref[0] for ref in inputs))
+    M, J, D, aref, lower, upper, a0, *of_cones = (ref[0] for ref in inputs)
+    cones = elliptic.Cones(*of_cones) if of_cones else None
+    given = Constraints(M, J, D, aref, lower, upper, a0, cones)
 
     def newton(H: Array, gradient: Array) -> tuple[Array, None]:
         return -times(swept(H, n), gradient), None

@@ -19,7 +19,6 @@ Six things differ from `mjx.step`. Only the last two change values:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -29,13 +28,9 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from mjx_drax.kernels.constraint_solver import (
-    ITERATIONS,
-    LEAST_SHARE,
-    Constraints,
-    constrained_minimum,
-)
-from mjx_drax.kernels.linalg import cholesky, solve, solve_positive, symmetric
+from mjx_drax.kernels.constraint_solver import Constraints, constrained_minimum
+from mjx_drax.kernels.elliptic_cones import Cones
+from mjx_drax.kernels.linalg import solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
 from mjx_drax.physics.collision import collision, make_data
@@ -51,10 +46,6 @@ from mjx_drax.physics.tree import (
     mass_matrix,
     rne,
 )
-
-SIZES = 24
-"""Step sizes, 1, 1/2, 1/4, ..., of Newton's method among elliptic cones, whose curvature changes
-fast where a contact is about to open."""
 
 RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))
 """Of each stage: the share of the timestep that it goes along the rate of the stage before, and its
@@ -139,22 +130,34 @@ def _law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Constrai
 def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
     """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
     model, data = jax.lax.stop_gradient((model, data))
-    if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
-        rows = internal(data)
-        loss, D = rows.efc_frictionloss, rows.efc_D
-        slides = loss / jnp.where(D > 0.0, D, 1.0)
-        always = np.arange(len(D)) < rows.ne + rows.nf
-        held = jnp.where(always, jnp.inf, 0.0).astype(D.dtype)
-        lower = jnp.where(loss > 0.0, -slides, -jnp.inf)
-        upper = jnp.where(loss > 0.0, slides, held)
-        of_rows = D, rows.efc_aref, lower, upper
-        return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, data.qacc_smooth))
-    law = partial(_law, model, data)
+    rows, cones = internal(data), None
+    loss, D = rows.efc_frictionloss, rows.efc_D
+    slides = loss / jnp.where(D > 0.0, D, 1.0)
+    always = np.arange(len(D)) < rows.ne + rows.nf
+    held = jnp.where(always, jnp.inf, 0.0).astype(D.dtype)
+    lower = jnp.where(loss > 0.0, -slides, -jnp.inf)
+    upper = jnp.where(loss > 0.0, slides, held)
+    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        cones, D = _cones(model, data)
+    of_rows = D, rows.efc_aref, lower, upper
+    return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, data.qacc_smooth, cones))
 
-    def hessian(qacc: Array) -> Array:
-        return symmetric(jax.jacfwd(lambda a: law(a)[0])(qacc))
 
-    return _minimum(law, hessian, data.qacc_smooth)
+def _cones(model: mjx.Model, data: mjx.Data) -> tuple[Cones | None, Array]:
+    """The elliptic friction cones, and D (m,), 0 in their rows."""
+    contact, D = internal(data).contact, internal(data).efc_D
+    with_friction = np.flatnonzero(np.asarray(contact.dim) > 1)
+    if not len(with_friction):
+        return None, D
+    sizes, starts = (np.asarray(a)[with_friction] for a in (contact.dim, contact.efc_address))
+    which = np.repeat(np.arange(len(sizes)), sizes)
+    entry = np.concatenate([np.arange(size) for size in sizes])
+    at, rows = starts[which] + entry, jnp.zeros_like(D)
+    friction = contact.friction[with_friction]
+    mu = friction[:, 0] / jnp.sqrt(model.opt.impratio)
+    scale = jnp.concatenate([mu[:, None], friction], axis=1)[which, entry]
+    values = 1.0 + which, entry == 0, scale, mu[which], (D[starts] / mu**2)[which]
+    return Cones(*(rows.at[at].set(value) for value in values)), D.at[at].set(0.0)
 
 
 def _constrained(
@@ -172,41 +175,6 @@ def _constrained(
     _, forces = _law(model, data, qacc)
     data = data.replace(qacc=qacc, qfrc_constraint=forces.Ma - data.qfrc_smooth)
     return with_internal(data, efc_force=forces.efc_force)
-
-
-def _minimum(
-    law: Callable[[Array], tuple[Array, ConstraintForces]],
-    hessian: Callable[[Array], Array],
-    start: Array,
-) -> tuple[Array, Array]:
-    """Where the gradient of `law` is zero, to rounding, by Newton's method.
-
-    Returns that acceleration (nv,) and the factor of the Hessian there: the last iteration, which
-    finds no better one, has made it. The function is piecewise quadratic where friction cones are
-    pyramids. Once the constraints that are active stay the same, a full step ends at the minimum;
-    before, a shorter one may be better.
-    """
-    sizes = 0.5 ** jnp.arange(SIZES)
-
-    def newton(carry: Any) -> Any:
-        count, _, _, qacc, gradient, cost = carry
-        factor = cholesky(hessian(qacc))
-        direction = solve(factor, gradient)
-        tries = qacc - sizes[:, None] * direction
-        gradients, forces = jax.vmap(law)(tries)
-        best = jnp.argmin(forces.cost)
-        rounding = jnp.finfo(cost.dtype).eps * jnp.abs(cost)
-        least = jnp.maximum(rounding, LEAST_SHARE * jnp.dot(gradient, direction))
-        better = cost - forces.cost[best] > least
-        found = tries[best], gradients[best], forces.cost[best]
-        kept = jax.tree.map(partial(jnp.where, better), found, (qacc, gradient, cost))
-        return count + 1, better, factor, *kept
-
-    gradient, forces = law(start)
-    none = jnp.zeros((len(start), len(start)), start.dtype)
-    begin = jnp.array(0), jnp.array(True), none, start, gradient, forces.cost
-    end: Any = jax.lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], newton, begin)
-    return end[3], end[2]
 
 
 def step(model: mjx.Model, x: Array, u: Array) -> Array:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_drax.kernels import elliptic_cones as elliptic
 from mjx_drax.kernels.constraint_solver import (
     Constraints,
     changes,
@@ -32,6 +33,82 @@ def drawn(rows=6, nv=5, m=7):
         rng.normal(size=(rows, nv)),
     )
     return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), given)
+
+
+def drawn_with_cones(rows=8, nv=5):
+    """Two contacts, of 3 and 4 rows, and a limit."""
+    given, rng = drawn(rows, nv, 8), np.random.default_rng(1)
+    of, normal = np.array([1, 1, 1, 2, 2, 2, 2, 0.0]), np.array([1, 0, 0, 1, 0, 0, 0, 0.0])
+    friction = rng.uniform(0.3, 2.0, size=(rows, 8))
+    mu = np.stack([friction[:, 1], friction[:, 4]], axis=1)[:, [0, 0, 0, 1, 1, 1, 1, 1]] / 3.0
+    scale = np.where(of > 0, np.where(normal > 0, mu, friction), 0.0)
+    weight = rng.uniform(1.0, 30.0, size=(rows, 2))[:, [0, 0, 0, 1, 1, 1, 1, 1]]
+    cones = elliptic.Cones(
+        *(np.broadcast_to(a, (rows, 8)) for a in (of, normal)), scale, mu, weight
+    )
+    bounds = np.full((rows, 8), -np.inf), np.zeros((rows, 8))
+    given = given._replace(D=np.where(of > 0, 0.0, given.D), lower=bounds[0], upper=bounds[1])
+    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), given._replace(cones=cones))
+
+
+def potential(cones, y):
+    """s(y) of the contacts, zone by zone as MuJoCo's documentation has it."""
+    u, total = cones.scale * y, 0.0
+    for contact in (1, 2):
+        mine = cones.of == contact
+        N = jnp.sum(jnp.where(mine, cones.normal * u, 0.0))
+        T = jnp.sqrt(jnp.sum(jnp.where(mine, (1.0 - cones.normal) * u**2, 0.0)))
+        mu, g = (jnp.max(jnp.where(mine, a, 0.0)) for a in (cones.mu, cones.weight))
+        sliding = 0.5 * g * (N - mu * T) ** 2 / (1.0 + mu**2)
+        sticking = jnp.where(mu * N + T <= 0.0, 0.5 * g * (N**2 + T**2), sliding)
+        total += jnp.where(mu * T <= N, 0.0, sticking)
+    return total
+
+
+def test_cones_have_the_derivatives_and_the_changes_of_their_potential():
+    cones = jax.tree.map(lambda a: a[0], drawn_with_cones().cones)
+    total = lambda x: elliptic.together(cones) @ x  # noqa: E731
+    rng, zones = np.random.default_rng(2), set()
+    with jax.enable_x64(True):
+        cones = jax.tree.map(lambda a: jnp.asarray(a, float), cones)
+        for y in rng.normal(size=(60, 8)):
+            at = elliptic.place(cones, total, y)
+            zones |= set(np.asarray(at.zone).tolist())
+            slope, bent = jax.grad(potential, 1)(cones, y), jax.hessian(potential, 1)(cones, y)
+            np.testing.assert_allclose(-elliptic.forces(cones, at), slope, atol=1e-9)
+            np.testing.assert_allclose(elliptic.curvature(cones, at), bent, atol=1e-8)
+            for size in (1e-3, 1.0, 4.0):
+                h = size * rng.normal(size=8)
+                ray = elliptic.ray(cones, total, at, h / size)
+                change, rise = elliptic.changes(cones, at, ray, size)
+                wanted = potential(cones, y + h) - potential(cones, y) - slope @ h
+                np.testing.assert_allclose(change.sum(), wanted, atol=1e-9)
+                np.testing.assert_allclose(
+                    rise, jax.grad(potential, 1)(cones, y + h) - slope, atol=1e-9
+                )
+    assert zones == {0.0, elliptic.STICKS, elliptic.SLIDES, elliptic.OPEN}
+
+
+def test_among_cones_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian():
+    given = drawn_with_cones()
+
+    def least(given, a):
+        y, apart = given.J @ a - given.aref, a - given.a0
+        limits = 0.5 * given.D @ jnp.clip(y, max=0.0) ** 2
+        return 0.5 * apart @ given.M @ apart + limits + potential(given.cones, y)
+
+    a, factor = jax.jit(jax.vmap(constrained_minimum))(given)
+    slope, bent = (jax.vmap(d(least, 1))(given, a) for d in (jax.grad, jax.hessian))
+    assert np.abs(slope).max() < 1e-4
+    np.testing.assert_allclose(factor @ factor.mT, bent, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_among_cones_the_kernel_finds_the_same_accelerations():
+    given = drawn_with_cones()
+    wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)
+    found = minima(given, interpret=True)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
 
 
 def gradient(given, a):
