@@ -48,10 +48,8 @@ from mjx_drax.kernels.riccati_blocks import (
 ITERATIONS, SIZES = 20, 16
 """Most iterations, and how many step sizes each chooses from, 1, 1/2, 1/4, ..., and one between."""
 
-LEAST_SHARE = 1e-3
-"""Least share of its predicted decrease that a step among the same constraints must achieve for
-another one to follow: in float32 costs go on decreasing by almost nothing. A step that meets a
-stiff contact on its way may be a small share of the whole, and others follow it."""
+DIGITS = 32.0
+"""A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
 MOST_DOFS, MOST_ROWS, MOST_IN_CONES = 64, 128, 64
 """Largest M and J of the kernel, and J with elliptic cones, whose kernel compiles for longer."""
@@ -109,13 +107,13 @@ def _total(cones: elliptic.Cones) -> elliptic.Total:
 
 def _forces(
     given: Constraints, total: elliptic.Total | None, y: Array
-) -> tuple[Array, Array, elliptic.Place | None]:
-    """-s'(y), what is the same as long as the same constraints are active, and where cones are."""
-    push, active = law(given, y)
+) -> tuple[Array, elliptic.Place | None]:
+    """-s'(y), and where cones are."""
+    push, _ = law(given, y)
     if given.cones is None or total is None:
-        return push, active, None
+        return push, None
     at = elliptic.place(given.cones, total, y)
-    return push + elliptic.forces(given.cones, at), active + at.zone, at
+    return push + elliptic.forces(given.cones, at), at
 
 
 def _line(
@@ -156,7 +154,7 @@ def iterated(
     def iteration(carry: Any) -> Any:
         count, _, *here, nothing, _ = carry
         _, rest, y = here
-        push, active, at = _forces(given, total, y)
+        push, at = _forces(given, total, y)
         pull = transposed_times(J, push)
         gradient = rest - pull
         direction, left = newton(hessian(given, y, product), gradient)
@@ -176,13 +174,11 @@ def iterated(
         between, _ = tried(size, size)
         on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
         size, least = jnp.where(between < least, size, on_ladder), jnp.minimum(between, least)
-        rounding = eps * jnp.sum(jnp.abs(direction) * (jnp.abs(rest) + jnp.abs(pull)))
-        _, later, _ = _forces(given, total, y - along[2])
-        same = jnp.max(jnp.abs(later - active)) == 0.0
-        better = -least > jnp.maximum(rounding, jnp.where(same, LEAST_SHARE * first, 0.0))
-        size = jnp.where(better, size, 0.0)
+        lost = eps * jnp.sum(jnp.abs(direction) * (jnp.abs(rest) + jnp.abs(pull)))
+        size = jnp.where(-least > lost, size, 0.0)
+        unfinished = -least > jnp.maximum(lost, (DIGITS * eps) ** 2 * jnp.sum(here[0] * rest))
         moved = (a - size * d for a, d in zip(here, along, strict=True))
-        return count + 1, better, *moved, 0.0 * least, left
+        return count + 1, unfinished, *moved, 0.0 * least, left
 
     none = jnp.zeros_like(a0)
     # Without a number that is carried on, the compiler of kernels crashes; this one stays 0
