@@ -91,6 +91,11 @@ def changes(given: Constraints, y: Array, h: Array) -> tuple[Array, Array]:
     return given.D * moved * (later - there + 0.5 * moved), given.D * moved
 
 
+def forces(given: Constraints, y: Array) -> Array:
+    """-s'(y), (m,), of cones too."""
+    return _forces(given, None if given.cones is None else _total(given.cones), y)[0]
+
+
 def hessian(given: Constraints, y: Array, product: Callable[..., Array] = jnp.matmul) -> Array:
     """M + J' s''(y) J, (nv, nv)."""
     _, active = law(given, y)

@@ -65,7 +65,10 @@ def place(cones: Cones, total: Total, y: Array) -> Place:
     """Where y (m,) is."""
     u = cones.scale * y
     tangent = (1.0 - cones.normal) * u
-    return placed(cones, u, total(cones.normal * u), jnp.sqrt(total(tangent * tangent)))
+    squared = total(tangent * tangent)
+    moves = squared > 0.0  # a root has no derivative at 0
+    T = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
+    return placed(cones, u, total(cones.normal * u), T)
 
 
 def placed(cones: Cones, u: Array, N: Array, T: Array) -> Place:

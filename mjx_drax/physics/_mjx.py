@@ -33,7 +33,6 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
         closest_segment_to_segment_points as closest_segment_to_segment_points,
     )
     from mujoco.mjx._src.math import make_frame as make_frame
-    from mujoco.mjx._src.solver import Context as ConstraintForces  # noqa: F401
     from mujoco.mjx._src.types import ConvexMesh as ConvexMesh
 
 

@@ -32,6 +32,10 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.tracing import plain, require_functions
 from mjx_drax.problem.trajectory import Box, Trajectory, box
 
+STOPPED = 10.0
+"""Damping times timestep, in inertias of a joint, above which a velocity is no state that the model
+comes to. A base that is held by a damping of 1e11 would be pushed with as many newtons."""
+
 
 def from_mjcf(
     model: str | Path | mujoco.MjModel,
@@ -96,9 +100,10 @@ def from_mjcf(
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
         x_scatter: box for initial knots; by default the bounds, and where those are infinite +-pi
             rad for hinges, +-1 m for slides and free joints, +-0.3 for the parts of quaternions and
-            +-5 (rad/s or m/s) for velocities about x_init. Half of the chains then start closer to
-            x_init, by random factors. Where contacts, limits or dry friction act, or states hold
-            quaternions, all do, also with a box given here: see `Problem.draw`.
+            +-5 (rad/s or m/s) for velocities about x_init, unless damping ends these within a step
+            of physics. Half of the chains then start closer to x_init, by random factors. Where
+            contacts, limits or dry friction act, or states hold quaternions, all do, also with a
+            box given here: see `Problem.draw`.
         u_scatter: the same for controls; by default their bounds, or +-1 where those are infinite.
             Where contacts, limits or dry friction act, about the controls that hold x_init.
         contacts: how many contact points the plan keeps, of each friction dimension (condim): the
@@ -260,7 +265,9 @@ def _scatter(
     positions = np.ones(model.nq)
     positions[model.jnt_qposadr[model.jnt_type == HINGE]] = np.pi
     positions[dynamics.joints.is_quaternion] = 0.3
-    half = np.concatenate([positions, np.full(model.nv, 5.0), np.ones(model.na)])
+    stopped = model.dof_damping * model.opt.timestep > STOPPED * model.dof_M0
+    velocities = np.where(stopped, 0.0, 5.0)
+    half = np.concatenate([positions, velocities, np.ones(model.na)])
     return scatter_box(bounds, jnp.asarray(x_init), jnp.asarray(half), x, u)
 
 

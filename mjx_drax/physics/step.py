@@ -28,11 +28,11 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from mjx_drax.kernels.constraint_solver import Constraints, constrained_minimum
+from mjx_drax.kernels.constraint_solver import Constraints, constrained_minimum, forces
 from mjx_drax.kernels.elliptic_cones import Cones
 from mjx_drax.kernels.linalg import solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
-from mjx_drax.physics._mjx import ConstraintForces, internal, mjx, with_internal
+from mjx_drax.physics._mjx import internal, mjx, with_internal
 from mjx_drax.physics.collision import collision, make_data
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import BALL, FREE, Joints
@@ -121,15 +121,8 @@ def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
     return -stiffness[model.dof_jntid] * away
 
 
-def _law(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, ConstraintForces]:
-    """The gradient (nv,) of what the acceleration minimizes, and constraint forces."""
-    forces = ConstraintForces.create(model, data.replace(qacc=qacc), grad=False)
-    return forces.Ma - data.qfrc_smooth - forces.qfrc_constraint, forces
-
-
-def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
-    """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
-    model, data = jax.lax.stop_gradient((model, data))
+def _constraints(model: mjx.Model, data: mjx.Data) -> Constraints:
+    """What the acceleration under constraints minimizes."""
     rows, cones = internal(data), None
     loss, D = rows.efc_frictionloss, rows.efc_D
     slides = loss / jnp.where(D > 0.0, D, 1.0)
@@ -139,8 +132,19 @@ def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
     upper = jnp.where(loss > 0.0, slides, held)
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         cones, D = _cones(model, data)
-    of_rows = D, rows.efc_aref, lower, upper
-    return constrained_minimum(Constraints(rows.M, rows.efc_J, *of_rows, data.qacc_smooth, cones))
+    return Constraints(rows.M, rows.efc_J, D, rows.efc_aref, lower, upper, data.qacc_smooth, cones)
+
+
+def _forces(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Array]:
+    """Forces of constraints at an acceleration: of all rows (m,), and on joints (nv,)."""
+    given = _constraints(model, data)
+    found = forces(given, given.J @ qacc - given.aref)
+    return found, given.J.T @ found
+
+
+def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
+    """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
+    return constrained_minimum(_constraints(*jax.lax.stop_gradient((model, data))))
 
 
 def _cones(model: mjx.Model, data: mjx.Data) -> tuple[Cones | None, Array]:
@@ -170,11 +174,12 @@ def _constrained(
     if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
     qacc, factor = solution or _solution(model, data)
+    M = internal(data).M
     if derivatives:
-        qacc = qacc - solve(factor, _law(model, data, qacc)[0])
-    _, forces = _law(model, data, qacc)
-    data = data.replace(qacc=qacc, qfrc_constraint=forces.Ma - data.qfrc_smooth)
-    return with_internal(data, efc_force=forces.efc_force)
+        pull = _forces(model, data, qacc)[1]
+        qacc = qacc - solve(factor, M @ qacc - data.qfrc_smooth - pull)
+    data = data.replace(qacc=qacc, qfrc_constraint=M @ qacc - data.qfrc_smooth)
+    return with_internal(data, efc_force=_forces(model, data, qacc)[0])
 
 
 def step(model: mjx.Model, x: Array, u: Array) -> Array:
@@ -249,8 +254,8 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
             at = _smooth(model, start.replace(**changed))
         else:  # nothing has moved
             at = _driven(model, placed.replace(**changed))
-        forces = ConstraintForces.create(model, at.replace(qacc=a), grad=False)
-        pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + forces.qfrc_constraint
+        pull = _forces(model, at, a)[1]
+        pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + pull
         left, later = _tendon_bias(model, at, a) - pushed, data.qvel[:0]
         if not explicit:
             later = _tendon_inertia_times(model, at, b - a) + _damping_times(model, at, b)

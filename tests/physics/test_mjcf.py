@@ -169,6 +169,18 @@ def test_given_bounds_are_added_to_the_ranges():
     np.testing.assert_allclose(bounds.u_upper, [3.0, 5.0])
 
 
+def test_no_velocities_are_drawn_where_damping_ends_them_within_a_step():
+    """As where a robot's base is held by an enormous damping, and not by a weld."""
+    held = """
+    <mujoco><worldbody><body>
+      <joint name="base" type="slide" damping="1e11"/><geom size="0.1"/>
+      <body><joint name="arm" damping="1" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body>
+    </body></worldbody><actuator><motor joint="arm"/></actuator></mujoco>
+    """
+    task = from_mjcf(held, horizon=0.2, running_cost=lambda data, u: u @ u)
+    np.testing.assert_array_equal(task.scatter.x_upper[2:], [0.0, 5.0])
+
+
 def test_scatter_is_finite_and_inside_the_bounds():
     task = problem(arm())
     z = task.draw(jax.random.key(0))
