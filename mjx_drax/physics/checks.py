@@ -33,7 +33,7 @@ from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, put_model
 from mjx_drax.physics.pairs import Contacts, contact_pairs, left_out
 from mjx_drax.physics.source import binary
-from mjx_drax.physics.states import Engine, integrate, quiet, set_state
+from mjx_drax.physics.states import Engine, integrate, quiet, set_state, stopped_at_once
 
 SINGULAR = 1e-10
 """Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""
@@ -240,7 +240,7 @@ def samples(engine: Engine, x_init: np.ndarray, bounded: np.ndarray, seed: int =
     """
     model, rng = engine.model, np.random.default_rng(seed)
     nv, scale = model.nv, np.zeros(2 * model.nv + model.na)
-    scale[:nv], scale[nv : 2 * nv] = SHIFT, SPEED
+    scale[:nv], scale[nv : 2 * nv] = SHIFT, np.where(stopped_at_once(model), 0.0, SPEED)
     u = rng.uniform(*control_ranges(model), (2 + len(MOMENTS), model.nu))
     away = scale * rng.normal(size=scale.shape)
     x = [integrate(model, x_init, share * away) for share in (HAIR, 1.0)]

@@ -24,6 +24,7 @@ from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.near import affordable
 from mjx_drax.physics.pairs import Contacts
 from mjx_drax.physics.source import load, model_name, origin_of
+from mjx_drax.physics.states import stopped_at_once
 from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
 from mjx_drax.problem.choices import Choices, parameter_ends, phases_of
 from mjx_drax.problem.differentiators import Differentiator
@@ -31,10 +32,6 @@ from mjx_drax.problem.extended import named
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.tracing import plain, require_functions
 from mjx_drax.problem.trajectory import Box, Trajectory, box
-
-STOPPED = 10.0
-"""Damping times timestep, in inertias of a joint, above which a velocity is no state that the model
-comes to. A base that is held by a damping of 1e11 would be pushed with as many newtons."""
 
 
 def from_mjcf(
@@ -265,8 +262,7 @@ def _scatter(
     positions = np.ones(model.nq)
     positions[model.jnt_qposadr[model.jnt_type == HINGE]] = np.pi
     positions[dynamics.joints.is_quaternion] = 0.3
-    stopped = model.dof_damping * model.opt.timestep > STOPPED * model.dof_M0
-    velocities = np.where(stopped, 0.0, 5.0)
+    velocities = np.where(stopped_at_once(model), 0.0, 5.0)
     half = np.concatenate([positions, velocities, np.ones(model.na)])
     return scatter_box(bounds, jnp.asarray(x_init), jnp.asarray(half), x, u)
 

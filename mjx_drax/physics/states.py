@@ -19,6 +19,10 @@ from mjx_drax.physics.pairs import Contacts, Pair, left_out
 
 Floats = npt.NDArray[np.floating]
 
+STOPPED = 10.0
+"""Damping times timestep, in inertias, above which a velocity is no state that a model comes to. A
+base that is held by a damping of 1e11 would be pushed with as many newtons."""
+
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
@@ -34,6 +38,12 @@ def quiet() -> Iterator[None]:
 def finite(states: Floats) -> Floats:
     """The states (T, ...) of a replay, up to the first that is not finite."""
     return states[: int(np.cumprod(np.isfinite(states).all(axis=1)).sum())]
+
+
+def stopped_at_once(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
+    """Which velocities damping ends within a timestep, (nv,)."""
+    stopped: npt.NDArray[np.bool_] = model.dof_damping * model.opt.timestep > STOPPED * model.dof_M0
+    return stopped
 
 
 def set_state(model: mujoco.MjModel, data: mujoco.MjData, x: Floats) -> None:
