@@ -1,5 +1,7 @@
 """Accelerations under constraints: the plain solver, and its GPU kernel, interpreted."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,27 +68,31 @@ def potential(cones, y):
 
 
 def test_cones_have_the_derivatives_and_the_changes_of_their_potential():
-    cones = jax.tree.map(lambda a: a[0], drawn_with_cones().cones)
-    total = lambda x: elliptic.together(cones) @ x  # noqa: E731
-    rng, zones = np.random.default_rng(2), set()
+    def compared(cones, y, size, direction):
+        def total(x):
+            return elliptic.together(cones) @ x
+
+        at, slope = elliptic.place(cones, total, y), jax.grad(potential, 1)
+        h, ray = size * direction, elliptic.ray(cones, total, at, direction)
+        change, rise = elliptic.changes(cones, at, ray, size)
+        grown = potential(cones, y + h) - potential(cones, y) - slope(cones, y) @ h
+        pairs = (
+            (-elliptic.forces(cones, at), slope(cones, y)),
+            (elliptic.curvature(cones, at), jax.hessian(potential, 1)(cones, y)),
+            (change.sum(), grown),
+            (rise, slope(cones, y + h) - slope(cones, y)),
+        )
+        return at.zone, pairs
+
+    rng = np.random.default_rng(2)
     with jax.enable_x64(True):
-        cones = jax.tree.map(lambda a: jnp.asarray(a, float), cones)
-        for y in rng.normal(size=(60, 8)):
-            at = elliptic.place(cones, total, y)
-            zones |= set(np.asarray(at.zone).tolist())
-            slope, bent = jax.grad(potential, 1)(cones, y), jax.hessian(potential, 1)(cones, y)
-            np.testing.assert_allclose(-elliptic.forces(cones, at), slope, atol=1e-9)
-            np.testing.assert_allclose(elliptic.curvature(cones, at), bent, atol=1e-8)
-            for size in (1e-3, 1.0, 4.0):
-                h = size * rng.normal(size=8)
-                ray = elliptic.ray(cones, total, at, h / size)
-                change, rise = elliptic.changes(cones, at, ray, size)
-                wanted = potential(cones, y + h) - potential(cones, y) - slope @ h
-                np.testing.assert_allclose(change.sum(), wanted, atol=1e-9)
-                np.testing.assert_allclose(
-                    rise, jax.grad(potential, 1)(cones, y + h) - slope, atol=1e-9
-                )
-    assert zones == {0.0, elliptic.STICKS, elliptic.SLIDES, elliptic.OPEN}
+        cones = jax.tree.map(lambda a: jnp.asarray(a[0], float), drawn_with_cones().cones)
+        y, direction = rng.normal(size=(2, 200, 8))
+        sizes = rng.choice([1e-3, 1.0, 4.0], size=200)
+        zones, pairs = jax.jit(jax.vmap(partial(compared, cones)))(y, sizes, direction)
+    for found, wanted in pairs:
+        np.testing.assert_allclose(found, wanted, atol=1e-8)
+    assert set(np.unique(zones)) == {0.0, elliptic.STICKS, elliptic.SLIDES, elliptic.OPEN}
 
 
 def test_among_cones_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian():
