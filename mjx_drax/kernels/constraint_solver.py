@@ -178,7 +178,8 @@ def iterated(
         size, least = _level(sizes, slope, -first), jnp.min(change)
         between, _ = tried(size, size)
         on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
-        size, least = jnp.where(between < least, size, on_ladder), jnp.minimum(between, least)
+        inside = between < least
+        size, least = jnp.where(inside, size, on_ladder), jnp.where(inside, between, least)
         lost = eps * jnp.sum(jnp.abs(direction) * (jnp.abs(rest) + jnp.abs(pull)))
         size = jnp.where(-least > lost, size, 0.0)
         unfinished = -least > jnp.maximum(lost, (DIGITS * eps) ** 2 * jnp.sum(here[0] * rest))

@@ -136,7 +136,8 @@ def changes(cones: Cones, at: Place, ray: Ray, size: Array) -> tuple[Array, Arra
     mu, g = cones.mu, cones.weight
     step = size * ray.step
     tangent, more = (1.0 - cones.normal) * step, size * (2.0 * ray.turn + size * ray.square)
-    N, T = at.N + size * ray.N, jnp.sqrt(jnp.maximum(at.T * at.T + more, 0.0))
+    digits = jnp.finfo(at.T.dtype).eps * (at.T * at.T + size * size * ray.square)
+    N, T = at.N + size * ray.N, jnp.sqrt(jnp.maximum(at.T * at.T + more, digits))
     new = placed(cones, at.u + step, N, T)
     both = at.T + T
     longer = more / jnp.where(both > 0.0, both, 1.0)
