@@ -2,11 +2,11 @@
 
     python -m mjx_drax.studies.answers [TASK[:CHAINS] ...] [--seeds N]
 
-A row for each task and seed: the share of chains whose replay succeeds; the best and the median
-cost of those; the share of all chains within 1 % of the best, and the share that is optimal, with
-a residual below the tolerance; whether the best chain is certified; iterations; and seconds to
-solve and to compile. Of each task the first row's solve time has work that is done once in a
-process.
+A row for each task and seed: the share of chains whose replay with feedback succeeds; the best and
+the median cost of those; the share of all chains within 1 % of the best, and the share that is
+optimal, with a residual below the tolerance; the share that is certified, as a replay with or
+without feedback succeeds; iterations; and seconds to solve and to compile. Of each task the first
+row's solve time has work that is done once in a process.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def line(solution: Solution) -> str:
     return (
         f"| {solution.problem.name} | {solution.chains:,} | {solution.seed} | {good.mean():.2%} "
         f"| {best:.6g} | {median:.5g} | {close:.0%} | {optimal.mean():.1%} "
-        f"| {'yes' if solution.certified else 'no'} | {solution.iterations} "
+        f"| {solution.certified_chains.mean():.1%} | {solution.iterations} "
         f"| {solution.solve_time:.3f} | {solution.compile_time:.0f} |"
     )
 
