@@ -170,7 +170,7 @@ def _constrained(
     solution: tuple[Array, Array] | None = None,
     derivatives: bool = True,
 ) -> mjx.Data:
-    """`data` with the acceleration and the forces under constraints, and with derivatives."""
+    """`data` with the acceleration and the forces under constraints, and if asked, derivatives."""
     if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
     qacc, factor = solution or _solution(model, data)

@@ -109,14 +109,6 @@ def test_among_cones_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian(
     np.testing.assert_allclose(factor @ factor.mT, bent, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_among_cones_the_kernel_finds_the_same_accelerations():
-    given = drawn_with_cones()
-    wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)
-    found = minima(given, interpret=True)
-    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
-
-
 def gradient(given, a):
     return given.M @ (a - given.a0) - given.J.T @ law(given, given.J @ a - given.aref)[0]
 
@@ -157,8 +149,9 @@ def test_an_enormous_force_elsewhere_changes_nothing():
 
 
 @pytest.mark.slow
-def test_the_kernel_finds_the_same_accelerations():
-    given = drawn()
+@pytest.mark.parametrize("make", [drawn, drawn_with_cones])
+def test_the_kernel_finds_the_same_accelerations(make):
+    given = make()
     wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)
     found = minima(given, interpret=True)
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
