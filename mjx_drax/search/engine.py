@@ -569,7 +569,7 @@ class Search:
         gains, dtype = with_feedback * np.asarray(chains.state.gains), knots.x.dtype
         start = self.family.starts(self.indices, knots)
         plan = np.concatenate([start[:, None], knots.x], axis=1)
-        states, controls = self.family.replay(self.indices, plan, np.asarray(knots.u), gains)
+        states, controls, _ = self.family.tracked(self.indices, plan, np.asarray(knots.u), gains)
         x, u = (jnp.asarray(a, dtype) for a in (states[:, 1:], controls))
         rolled = Trajectory(x, u, start=knots.start)
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)

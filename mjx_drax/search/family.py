@@ -21,6 +21,12 @@ from mjx_drax.problem.tracing import plain
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import Question, partition
 
+LESS_FEEDBACK = (0.5, 0.25)
+"""Shares of the feedback gains that are tried where a replay with all of them leaves its plan."""
+
+OFF_PLAN = 1e-2
+"""A replay leaves its plan if it is off by more than this share of the plan's own way."""
+
 
 @dataclass(frozen=True)
 class Family:
@@ -228,6 +234,39 @@ class Family:
         parts = (np.split(a, len(indices)) for a in (plan, u, gains))
         ran = [self.at(int(i)).replay(*own) for i, *own in zip(indices, *parts, strict=True)]
         return np.concatenate([run[0] for run in ran]), np.concatenate([run[1] for run in ran])
+
+    def tracked(
+        self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Replays with feedback, and the gains they used, which may be smaller than the given ones.
+
+        A linear model of contacts holds for small changes only, and gains that trust it can make
+        controls chatter between their bounds. So where f has kinks and a replay leaves its plan, it
+        is tried with half and with a quarter of the gains, and the nearest replay is taken.
+        """
+        states, controls = self.replay(indices, plan, u, gains)
+        if not self.problem.dynamics.kinked or not gains.any():
+            return states, controls, gains
+        difference = self.at(0).dynamics.host_difference
+        of = np.repeat(indices, len(u) // len(indices))  # the problem of each row
+
+        def largest(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+            return np.nan_to_num(np.abs(difference(x, y)).max(axis=(1, 2)), nan=np.inf)
+
+        way, off = largest(plan, np.broadcast_to(plan[:, :1], plan.shape)), largest(states, plan)
+        best = [np.array(a) for a in (states, controls, gains, off)]
+        for share in LESS_FEEDBACK:
+            rows = np.flatnonzero(best[-1] > OFF_PLAN * way)
+            if not len(rows):
+                break
+            less = share * gains[rows]
+            ran = self.replay(of[rows], plan[rows], u[rows], less)
+            new = [*ran, less, largest(ran[0], plan[rows])]
+            nearer = new[-1] < best[-1][rows]
+            for whole, part in zip(best, new, strict=True):
+                whole[rows[nearer]] = part[nearer]
+        states, controls, gains, _ = best
+        return states, controls, gains
 
 
 def _faults(problem: Problem) -> Array:

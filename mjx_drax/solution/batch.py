@@ -275,7 +275,7 @@ def _certified(
     )
     chosen: Trajectory = jax.tree.map(lambda a: np.asarray(a)[rows], state.trajectory)
     plan = np.concatenate([family.starts(np.arange(family.count), chosen)[:, None], x], axis=1)
-    open_loop, feedback = both_ways(family, plan, u, gains, tolerances)
+    open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
     return BatchSolution(
         family=family,
         x=plan,

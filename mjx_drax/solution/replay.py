@@ -126,21 +126,20 @@ def replays(
 
 def both_ways(
     family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray, tolerances: Tolerances
-) -> tuple[Replays, Replays]:
-    """Replays of plans, open loop and with feedback: one of each problem, or all of one.
+) -> tuple[Replays, Replays, np.ndarray]:
+    """Replays of plans, open loop and with feedback, and the gains that the feedback used.
 
     Args:
+        family: one problem for each plan, or one for all.
         plan: planned states x_0..x_K, (n, K + 1, nx).
         u: planned controls, (n, K, nu).
-        gains: feedback, (n, K, nu, ndx).
+        gains: feedback, (n, K, nu, ndx); see `Family.tracked`.
     """
     which = np.arange(family.count)
-
-    def replayed(share: float) -> Replays:
-        ran = family.replay(which, plan, u, share * gains)
-        return judged(family, plan, u, ran, tolerances)
-
-    return replayed(0.0), replayed(1.0)
+    open_loop = family.replay(which, plan, u, 0.0 * gains)
+    states, controls, used = family.tracked(which, plan, u, gains)
+    feedback = judged(family, plan, u, (states, controls), tolerances)
+    return judged(family, plan, u, open_loop, tolerances), feedback, used
 
 
 def judged(

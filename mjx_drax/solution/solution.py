@@ -90,6 +90,12 @@ class Solution(Results):
         problem, u = self.problem, np.asarray(self.trajectories.u)
         chosen = self.tolerances if tolerances is None else as_tolerances(tolerances)
         plan = self.plans.astype(float)
-        ran = both_ways(Family.of_one(problem), plan, u, self.gains, chosen)
-        engine = problem.dynamics.engine
-        return replace(self, open_loop=ran[0], feedback=ran[1], tolerances=chosen, engine=engine)
+        open_loop, feedback, gains = both_ways(Family.of_one(problem), plan, u, self.gains, chosen)
+        return replace(
+            self,
+            open_loop=open_loop,
+            feedback=feedback,
+            gains=gains,
+            tolerances=chosen,
+            engine=problem.dynamics.engine,
+        )

