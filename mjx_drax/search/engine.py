@@ -33,7 +33,7 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
 from mjx_drax.search.devices import gathered, spread
-from mjx_drax.search.family import Family
+from mjx_drax.search.family import Family, Tracked
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import (
     FEASIBLE,
@@ -74,11 +74,23 @@ Progress = Callable[[int, int, Info], None]
 @register_dataclass
 @dataclass(frozen=True)
 class Chains:
-    """Where chains are: one row each, and since which iteration each was feasible, or -1."""
+    """Where chains are, one row each.
+
+    Attributes:
+        state, info: of every row.
+        feasible_since: since which iteration each was feasible, or -1, (rows,).
+        missed: whether it was replayed, and did not come to where it should, (rows,).
+    """
 
     state: State
     info: Info
     feasible_since: np.ndarray
+    missed: np.ndarray
+
+    @classmethod
+    def of(cls, state: State, info: Info, feasible_since: np.ndarray) -> Chains:
+        """Chains that were not replayed."""
+        return cls(state, info, feasible_since, np.zeros(len(feasible_since), bool))
 
     @property
     def cost(self) -> np.ndarray:
@@ -89,6 +101,11 @@ class Chains:
     def feasible(self) -> np.ndarray:
         """Whether max|h| < `FEASIBLE`, (rows,)."""
         return np.asarray(self.info.max_defect) < FEASIBLE
+
+    @property
+    def sound(self) -> np.ndarray:
+        """Feasible, and not known to be missed by their replay, (rows,)."""
+        return self.feasible & ~self.missed
 
 
 @register_dataclass
@@ -260,7 +277,7 @@ class Search:
         if not saved:  # else it will be replaced; an answer needs no compiling
             _, info = jax.block_until_ready(self._iterated(state, 0, 0))
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
-        now = Chains(state, info, np.full(rows, -1))
+        now = Chains.of(state, info, np.full(rows, -1))
         kept = None if family.alone else _unset(now, family.count * self.chains)
         owners, ones = np.tile(np.arange(self.chains), self.size), np.ones(rows)
         records = ((0, info),)
@@ -284,12 +301,12 @@ class Search:
         state = self._begun(0, knots, keys)  # which may have moved them off their bounds
         state = replace(state, trajectory=replace(knots, slack=state.trajectory.slack))
         state, info = self._iterated(state, 0, 0)
-        guessed = Chains(state, info, np.zeros(self.chains, int))
+        guessed = Chains.of(state, info, np.zeros(self.chains, int))
         inside = np.asarray(info.max_violation) == 0.0
         better = _improved(found, guessed, self.stage.floor[:1]) & inside
         source = np.arange(self.chains) + self.chains * better
         state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
-        return Chains(state, info, np.where(better, 0, found.feasible_since))
+        return Chains.of(state, info, np.where(better, 0, found.feasible_since))
 
     def _begin_chunk(self) -> None:
         """New initial knots and random numbers for every row."""
@@ -300,13 +317,13 @@ class Search:
             left_alone = self._finished()[indices] & (self.settings.enough <= 1.0)
             assert stage.kept is not None
             shape = (self.family.count, self.chains)
-            cost = np.where(stage.kept.feasible, stage.kept.cost, np.inf).reshape(shape)[indices]
+            cost = np.where(stage.kept.sound, stage.kept.cost, np.inf).reshape(shape)[indices]
             owners = np.concatenate([_owners(*row) for row in zip(left_alone, cost, strict=True)])
         knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, indices, stage.cost_scale)
         state = self._begun(stage.attempt, knots, keys)
         _, info = jax.block_until_ready(self._iterated(state, 0, 0))
-        now = Chains(state, info, np.full(len(owners), -1))
+        now = Chains.of(state, info, np.full(len(owners), -1))
         ones = np.ones(len(owners))
         self.stage = replace(
             stage, begun=True, owners=owners, now=now, damping=ones, step=0, rollouts=0
@@ -359,11 +376,11 @@ class Search:
         """Which chains of all problems are done, (N, chains)."""
         kept, shape = self.stage.kept, (self.family.count, self.chains)
         assert kept is not None
-        cost, feasible = kept.cost.reshape(shape), kept.feasible.reshape(shape)
+        cost, sound = kept.cost.reshape(shape), kept.sound.reshape(shape)
         cost = cost - self.stage.floor[:, None]
         assert self.settings.within is not None
         size = np.asarray(kept.info.size).reshape(shape)
-        return finished(cost, feasible, size, self.settings.within, self.stage.cost_scale)
+        return finished(cost, sound, size, self.settings.within, self.stage.cost_scale)
 
     def _merged(self) -> Chains:
         """The best of all attempts, this one included."""
@@ -466,7 +483,7 @@ class Search:
                         require_sound(flow, self.family.at(0), knots)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
-                now = Chains(state, info, np.where(feasible, since, -1))
+                now = Chains.of(state, info, np.where(feasible, since, -1))
                 self._report(replace(stage, now=now, step=stop), before + stop)
                 if not np.asarray(gathered(state.alive, self.mesh)).any():
                     self._require_some(now)
@@ -506,7 +523,7 @@ class Search:
         assert settings.within is not None
         costs, feasible, sizes = now.cost, now.feasible, np.asarray(now.info.size)
         if kept is not None:  # the best may be among them
-            costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.feasible)
+            costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.sound)
             sizes = np.append(sizes, kept.info.size)
         costs = costs - stage.floor[0]
         near = finished(costs, feasible, sizes, settings.within, stage.cost_scale[0])
@@ -532,7 +549,11 @@ class Search:
         total = rollouts.first + rollouts.rounds
         if total == 0 or self.settings.after < rollouts.iterations:
             return True
-        if stage.now.feasible.all() and stage.rollouts == 0:
+        if (
+            stage.rollouts == 0
+            and stage.now.feasible.all()
+            and not self._replayed(stage.now, 1.0)[1].any()
+        ):
             return True
         try:
             self.stage = replace(self.stage, now=self._whole(self.stage.now))
@@ -547,14 +568,15 @@ class Search:
         stage, everyone = self.stage, np.arange(len(self.stage.owners))
         now, damping, count = stage.now, stage.damping, stage.rollouts + 1
         if stage.rollouts < first:
-            rolled = self._rolled_out(now, float(stage.rollouts > 0), stage.done)
-            self.stage = replace(stage, now=best_of(now, rolled, everyone), rollouts=count)
+            now = self._rolled_out(now, float(stage.rollouts > 0), stage.done)
+            self.stage = replace(stage, now=now, rollouts=count)
             return
         done, end = stage.done + iterations, self.flow.iterations + self.settings.after
         state = replace(now.state, damping=jnp.asarray(damping, now.state.damping.dtype))
         state, info = self._iterated(state, end - iterations, end)
-        found = self._whole(Chains(state, info, np.full(len(everyone), done)))
-        found = best_of(found, self._rolled_out(found, 1.0, done), everyone)
+        missed = np.ones(len(everyone), bool)  # until it is shown
+        found = self._whole(Chains(state, info, np.full(len(everyone), done), missed))
+        found = self._rolled_out(found, 1.0, done)
         better = _improved(now, found, np.repeat(stage.floor[self.indices], self.chains))
         now = best_of(now, found, everyone)
         factor = np.where(better, LESS_DAMPING, MORE_DAMPING)
@@ -563,18 +585,28 @@ class Search:
             count = total  # more would change nothing
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
 
+    def _replayed(self, chains: Chains, with_feedback: float) -> tuple[Tracked, np.ndarray]:
+        """Replays of chains, and which of them miss the goal; without one, which leave the plan."""
+        knots, family = chains.state.trajectory, self.family
+        gains = with_feedback * np.asarray(chains.state.gains)
+        plan = np.concatenate([family.starts(self.indices, knots)[:, None], knots.x], axis=1)
+        ran = family.tracked(self.indices, plan, np.asarray(knots.u), gains)
+        if family.problem.goal is None:
+            return ran, ran.left
+        return ran, ~family.reached(ran.states)
+
     def _rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
-        """Every chain's knots replaced by a rollout of its controls."""
-        knots = chains.state.trajectory
-        gains, dtype = with_feedback * np.asarray(chains.state.gains), knots.x.dtype
-        start = self.family.starts(self.indices, knots)
-        plan = np.concatenate([start[:, None], knots.x], axis=1)
-        states, controls, _ = self.family.tracked(self.indices, plan, np.asarray(knots.u), gains)
-        x, u = (jnp.asarray(a, dtype) for a in (states[:, 1:], controls))
+        """The best of chains and of rollouts of their controls, which become their knots."""
+        knots, (ran, missed) = chains.state.trajectory, self._replayed(chains, with_feedback)
+        x, u = (jnp.asarray(a, knots.x.dtype) for a in (ran.states[:, 1:], ran.controls))
         rolled = Trajectory(x, u, start=knots.start)
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
-        return self._whole(Chains(state, info, np.full(len(knots.x), done)))
+        own = missed if self.family.problem.goal is not None else np.zeros(len(x), bool)
+        found = self._whole(Chains(state, info, np.full(len(x), done), own))
+        if with_feedback:  # a plan is fine that is reached in one of two ways
+            missed = missed & chains.missed
+        return best_of(replace(chains, missed=missed), found, np.arange(len(x)))
 
     # Reports, recordings, checkpoints
 
@@ -770,17 +802,17 @@ def finished(
 
 
 def _improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
-    """Which chains became feasible, or cheaper by more than `CHEAPER`, (chains,)."""
+    """Which chains became sound, or cheaper by more than `CHEAPER`, (chains,)."""
     before, after = (np.asarray(a.info.cost, float) - floor for a in (kept, found))
     cheaper = after < before - CHEAPER * np.abs(before)
-    return found.feasible & (cheaper | ~kept.feasible)
+    return found.sound & (cheaper | ~kept.sound)
 
 
 def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
     """For every chain the best of what it has and of what was found for it.
 
     owners (chains,) says for which chain each row of `found` has worked. Feasible beats infeasible,
-    then the cheaper or the less infeasible wins.
+    then sound beats what its replay missed, then the cheaper or the less infeasible wins.
     """
     chains = len(owners)
 
@@ -789,14 +821,15 @@ def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
 
     infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
     of = np.concatenate([np.arange(chains), owners])
-    order = np.lexsort((value, infeasible, of))
+    missed = both(lambda a: a.missed)
+    order = np.lexsort((value, missed, infeasible, of))
     source = order[np.unique(of[order], return_index=True)[1]]
     pairs = (kept.state, kept.info), (found.state, found.info)
     if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(pairs)):
         state, info = jax.tree.map(lambda a, b: np.concatenate([a, b])[source], *pairs)
     else:
         state, info = _gather(*pairs, source)
-    return Chains(state, info, both(lambda a: a.feasible_since)[source])
+    return Chains(state, info, both(lambda a: a.feasible_since)[source], missed[source])
 
 
 @jax.jit

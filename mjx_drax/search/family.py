@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import plain
 from mjx_drax.problem.trajectory import Trajectory
@@ -26,6 +27,23 @@ LESS_FEEDBACK = (0.5, 0.25)
 
 OFF_PLAN = 1e-2
 """A replay leaves its plan if it is off by more than this share of the plan's own way."""
+
+
+class Tracked(NamedTuple):
+    """Replays with feedback: states, controls and gains of plans (n, K, ...), and how far off.
+
+    off (n,) is the largest deviation, over the largest distance of the plan from its start.
+    """
+
+    states: np.ndarray
+    controls: np.ndarray
+    gains: np.ndarray
+    off: np.ndarray
+
+    @property
+    def left(self) -> np.ndarray:
+        """Which plans were left, (n,)."""
+        return self.off > OFF_PLAN
 
 
 @dataclass(frozen=True)
@@ -237,36 +255,48 @@ class Family:
 
     def tracked(
         self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Replays with feedback, and the gains they used, which may be smaller than the given ones.
+    ) -> Tracked:
+        """Replays with feedback, whose gains may be smaller than the given ones.
 
         A linear model of contacts holds for small changes only, and gains that trust it can make
         controls chatter between their bounds. So where f has kinks and a replay leaves its plan, it
         is tried with half and with a quarter of the gains, and the nearest replay is taken.
         """
-        states, controls = self.replay(indices, plan, u, gains)
-        if not self.problem.dynamics.kinked or not gains.any():
-            return states, controls, gains
         difference = self.at(0).dynamics.host_difference
         of = np.repeat(indices, len(u) // len(indices))  # the problem of each row
 
         def largest(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-            return np.nan_to_num(np.abs(difference(x, y)).max(axis=(1, 2)), nan=np.inf)
+            with np.errstate(invalid="ignore"):  # of states that are not finite
+                return np.nan_to_num(np.abs(difference(x, y)).max(axis=(1, 2)), nan=np.inf)
 
-        way, off = largest(plan, np.broadcast_to(plan[:, :1], plan.shape)), largest(states, plan)
-        best = [np.array(a) for a in (states, controls, gains, off)]
-        for share in LESS_FEEDBACK:
-            rows = np.flatnonzero(best[-1] > OFF_PLAN * way)
+        def run(rows: np.ndarray, gains: np.ndarray) -> Tracked:
+            states, controls = self.replay(of[rows], plan[rows], u[rows], gains)
+            off = largest(states, plan[rows]) / np.maximum(way[rows], np.finfo(float).tiny)
+            return Tracked(states, controls, gains, off)
+
+        way = largest(plan, np.broadcast_to(plan[:, :1], plan.shape))
+        best = Tracked(*map(np.array, run(np.arange(len(u)), gains)))
+        less = LESS_FEEDBACK if self.problem.dynamics.kinked and gains.any() else ()
+        for share in less:
+            rows = np.flatnonzero(best.left)
             if not len(rows):
                 break
-            less = share * gains[rows]
-            ran = self.replay(of[rows], plan[rows], u[rows], less)
-            new = [*ran, less, largest(ran[0], plan[rows])]
-            nearer = new[-1] < best[-1][rows]
-            for whole, part in zip(best, new, strict=True):
+            found = run(rows, share * gains[rows])
+            nearer = found.off < best.off[rows]
+            for whole, part in zip(best, found, strict=True):
                 whole[rows[nearer]] = part[nearer]
-        states, controls, gains, _ = best
-        return states, controls, gains
+        return best
+
+    def reached(self, states: np.ndarray) -> np.ndarray:
+        """Whether motions x_0..x_K, (n, K + 1, nx), end at the goal, which the problems share."""
+        problem = self.at(0)
+        ends = [float(problem.times[-1])] * len(states)
+        if isinstance(problem.dynamics, Extended):  # each ends at a time of its own
+            times, begin = problem.dynamics.times, float(problem.t_init)
+            ends = [float(times(motion, begin)[-1]) for motion in states]
+        pairs = zip(states[:, -1], ends, strict=True)
+        found = [np.isfinite(x).all() and problem.reached(x, end) for x, end in pairs]
+        return np.array(found, bool)
 
 
 def _faults(problem: Problem) -> Array:

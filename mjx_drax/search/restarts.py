@@ -43,7 +43,7 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.checks import check_flow
 
-ENOUGH, ENOUGH_KINKED = 0.95, 0.6
+ENOUGH, ENOUGH_KINKED = 0.95, 0.9
 """Default share of chains to be done; attempts are long where f has kinks."""
 
 WITHIN, WITHIN_KINKED = 0.1, 1.0
@@ -88,7 +88,7 @@ class Restarts:
         attempts: largest number of attempts, the first included.
         within: a chain is done if it is feasible and its cost exceeds the best chain's by at most
             this share. None: 0.1, and 1 where f has kinks.
-        enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.6
+        enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
             where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
             finds better optima where all chains of the first attempt lead to the same ones.
         heated: whether attempts after the first are heated, or descend like the first. None: unless

@@ -18,7 +18,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
@@ -137,9 +136,9 @@ def both_ways(
     """
     which = np.arange(family.count)
     open_loop = family.replay(which, plan, u, 0.0 * gains)
-    states, controls, used = family.tracked(which, plan, u, gains)
-    feedback = judged(family, plan, u, (states, controls), tolerances)
-    return judged(family, plan, u, open_loop, tolerances), feedback, used
+    found = family.tracked(which, plan, u, gains)
+    feedback = judged(family, plan, u, (found.states, found.controls), tolerances)
+    return judged(family, plan, u, open_loop, tolerances), feedback, found.gains
 
 
 def judged(
@@ -162,14 +161,7 @@ def judged(
     cost, violations = measured(family, ran, off[:, -1], extents(problem, plan, u), tolerances)
     place = KINDS.index(GOAL)
     if problem.goal is not None:
-        ends = [float(problem.times[-1])] * len(states)
-        if isinstance(problem.dynamics, Extended):  # each ends at a time of its own
-            times, begin = problem.dynamics.times, float(problem.t_init)
-            ends = [float(times(motion, begin)[-1]) for motion in states]
-        pairs = zip(states[:, -1], ends, strict=True)
-        reached = np.array([problem.reached(x, end) for x, end in pairs])
-        finite = np.isfinite(states[:, -1]).all(axis=1)
-        violations.size[:, place] = ~(reached & finite)
+        violations.size[:, place] = ~family.reached(states)
         violations.allowed[:, place] = 0.0
         violations.knot[:, place] = problem.horizon
         violations.allowed[:, KINDS.index(TRACKING)] = np.nan

@@ -234,10 +234,10 @@ def test_gains_that_chatter_are_lowered_where_f_has_kinks_until_the_plan_is_trac
         Family.of_one(p).tracked(np.arange(1), plan, u, gains)
         for p in (problem, from_function(lambda x, u: x + u, nu=1, dt=0.1, **along))
     )
-    np.testing.assert_array_equal(gentle[2][:, 0, 0, 0], [-1.25, -2.5, -1.0])
-    assert gentle[0][0].max() == pytest.approx(0.01)
-    assert smooth[0][0].max() > 1.0
-    np.testing.assert_array_equal(smooth[2], gains)
+    np.testing.assert_array_equal(gentle.gains[:, 0, 0, 0], [-1.25, -2.5, -1.0])
+    assert gentle.states[0].max() == pytest.approx(0.01)
+    assert smooth.states[0].max() > 1.0
+    np.testing.assert_array_equal(smooth.gains, gains)
 
 
 def test_a_replay_that_turns_nan_is_no_success():
