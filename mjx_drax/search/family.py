@@ -22,7 +22,7 @@ from mjx_drax.problem.tracing import plain
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import Question, partition
 
-LESS_FEEDBACK = (0.5, 0.25)
+LESS_FEEDBACK = (0.3, 0.1, 0.03)
 """Shares of the feedback gains that are tried where a replay with all of them leaves its plan."""
 
 OFF_PLAN = 1e-2
@@ -259,8 +259,8 @@ class Family:
         """Replays with feedback, whose gains may be smaller than the given ones.
 
         A linear model of contacts holds for small changes only, and gains that trust it can make
-        controls chatter between their bounds. So where f has kinks and a replay leaves its plan, it
-        is tried with half and with a quarter of the gains, and the nearest replay is taken.
+        controls chatter between their bounds. So where f has kinks and a replay leaves its plan,
+        smaller ones are tried, and the nearest replay is taken.
         """
         difference = self.at(0).dynamics.host_difference
         of = np.repeat(indices, len(u) // len(indices))  # the problem of each row

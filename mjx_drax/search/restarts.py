@@ -86,8 +86,8 @@ class Restarts:
         descent: noise-free iterations of the first attempt, which measures the scales. None: the
             first attempt is like the others, and the schedules are in the flow's own scale.
         attempts: largest number of attempts, the first included.
-        within: a chain is done if it is feasible and its cost exceeds the best chain's by at most
-            this share. None: 0.1, and 1 where f has kinks.
+        within: a chain is done if it is feasible, reaches the goal where it was replayed, and
+            exceeds the best chain's cost by at most this share. None: 0.1; 1 where f has kinks.
         enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
             where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
             finds better optima where all chains of the first attempt lead to the same ones.
