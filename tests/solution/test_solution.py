@@ -228,7 +228,7 @@ def test_gains_that_chatter_are_lowered_where_f_has_kinks_until_the_plan_is_trac
     problem = from_dynamics(dynamics, **along)
     plan, u = np.zeros((3, 21, 1)), np.full((3, 20, 1), [[[0.01]], [[0.0]], [[0.01]]])
     plan[:, 1:] = [[[0.0]], [[0.0]], [[1.0]]]
-    gains = np.full((3, 20, 1, 1), -2.5)  # an error becomes -1.5 times itself; with 0.3 of them 0.25
+    gains = np.full((3, 20, 1, 1), -2.5)  # an error becomes -1.5 times itself; 0.25 with 0.3
     gains[2] = -1.0
     gentle, smooth = (
         Family.of_one(p).tracked(np.arange(1), plan, u, gains)
