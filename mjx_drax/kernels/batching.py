@@ -40,14 +40,18 @@ def merged_vmaps(
         has_rows: which arrays the function takes with an axis of rows; None: it takes one row.
     """
 
-    @custom_vmap
-    def function(*arguments: Any) -> Any:
+    def plain(*arguments: Any) -> Any:
         return one(*arguments) if has_rows is None else all_rows(has_rows, *arguments)
+
+    function = custom_vmap(plain)
 
     @function.def_vmap
     def with_another_axis(size: int, mapped: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
         """The mapped axis makes more rows: (size, rows, ...) becomes (size * rows, ...)."""
         arrays, tree = jax.tree.flatten(arguments)
+        if not any(jax.tree.leaves(tuple(mapped))):  # as in derivatives, of what is not varied
+            out = plain(*arguments)
+            return out, jax.tree.map(lambda _: False, out)
         before = has_rows or (False,) * len(arrays)
         flags = list(zip(arrays, before, jax.tree.leaves(tuple(mapped)), strict=True))
         rows = next((a.shape[new] for a, old, new in flags if old), 1)

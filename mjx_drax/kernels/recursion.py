@@ -1,20 +1,36 @@
-"""The affine recursion x_{k+1} = F_k x_k + f_k from x_0 = 0, for all k.
+"""Solutions of affine recursions x_{k+1} = F_k x_k + f_k from x_0 = 0.
 
-GPUs solve it in parallel over time, by an associative scan: a loop of K steps would be bound by
-its launches. CPUs take the steps one by one, which is less work and compiles in less time.
+Several right-hand sides at once: f_k and x_k are (n, m). On a CPU a loop over k does the least
+work. On GPUs each step of such a loop costs the launch of a kernel. There many chains are one
+kernel, which does all steps: a thread for each chain where blocks are small, else a block of
+threads. Elsewhere an associative scan does the same in about 2 log2(K) rounds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from jax import Array, lax
 
+from mjx_drax.kernels import riccati_blocks
+from mjx_drax.kernels.batching import (
+    block_for_each_row,
+    merged_vmaps,
+    of_one_precision,
+    on_gpu,
+    repeated,
+    thread_for_each_row,
+)
+from mjx_drax.kernels.riccati_gpu import THREADS, Layout, over_stages, write
+from mjx_drax.kernels.small_matrices import Matrix, add, matmul
 
-def affine_recursion(F: Array, f: Array) -> Array:
-    """x_1..x_K, (K, n, m), for F (K, n, n) and f (K, n, m)."""
-    states: Array = jax.lax.platform_dependent(F, f, cpu=step_by_step, default=in_parallel)
-    return states
+MAX_ENTRIES = 64
+"""Entries of F_k or of f_k that one thread keeps in its registers."""
 
 
 def step_by_step(F: Array, f: Array) -> Array:
@@ -34,3 +50,67 @@ def in_parallel(F: Array, f: Array) -> Array:
         return second[0] @ first[0], second[0] @ first[1] + second[1]
 
     return jax.lax.associative_scan(compose, (F, f))[1]
+
+
+def _one(F: Array, f: Array) -> Array:
+    states: Array = lax.platform_dependent(F, f, cpu=step_by_step, default=in_parallel)
+    return states
+
+
+def _all_chains(has_rows: Sequence[bool], *arguments: Array) -> Array:
+    F, f = repeated(has_rows, arguments)
+    n, m = f.shape[-2:]
+    plain, kernel = jax.vmap(_one), None
+    if on_gpu() and min(n, m) and of_one_precision((F, f)):
+        if max(n * n, n * m) <= MAX_ENTRIES:
+            kernel = by_threads
+        elif n <= riccati_blocks.MAX_NDX and F.dtype == np.float32:
+            kernel = by_blocks
+    if kernel is None:
+        return plain(F, f)
+    states: Array = lax.platform_dependent(F, f, cuda=kernel, default=plain)
+    return states
+
+
+affine_recursion = merged_vmaps(_one, _all_chains)
+"""x_1..x_K, (K, n, m), for F (K, n, n) and f (K, n, m)."""
+
+
+def by_threads(F: Array, f: Array, interpret: bool = False) -> Array:
+    """`affine_recursion` of many chains (chains, K, ...), a thread for each."""
+    chains, K, n, m = f.shape
+    given, found = Layout(F=(n, n), f=(n, m)), Layout(x=(n, m))
+
+    def body(given_ref: Any, found_ref: Any) -> None:
+        def stage(k: Array, here: dict[str, Any], x: Matrix) -> Matrix:
+            x = [add(*rows) for rows in zip(matmul(here["F"], x), here["f"], strict=True)]
+            write(found_ref, k, *x)
+            return x
+
+        zero = jnp.zeros_like(given_ref[0, 0, :])
+        over_stages(K, [given], [given_ref], stage, [[zero] * m for _ in range(n)])
+
+    packed = given.pack(F=F, f=f)
+    states = thread_for_each_row(body, THREADS, (K, found.size), [packed], interpret=interpret)
+    return found.unpack(states, "x")[:chains]
+
+
+def by_blocks(F: Array, f: Array, interpret: bool = False) -> Array:
+    """`affine_recursion` of many chains (chains, K, ...), a block of threads for each."""
+    chains, K, n, m = f.shape
+    N, M = riccati_blocks.tile(n), riccati_blocks.tile(m)
+    precision = lax.Precision.HIGHEST if interpret else riccati_blocks.SPLIT
+    product = partial(riccati_blocks.product, precision=precision)
+
+    def body(F_ref: Any, f_ref: Any, x_ref: Any) -> None:
+        def stage(k: Array, x: Array) -> Array:
+            x = product(F_ref[0, k], x) + f_ref[0, k]
+            x_ref[0, k] = x
+            return x
+
+        lax.fori_loop(0, K, stage, jnp.zeros_like(f_ref[0, 0]))
+
+    arrays = riccati_blocks.padded(F, N, N), riccati_blocks.padded(f, N, M)
+    shapes: dict[str, tuple[int, ...]] = {"x": (chains, K, N, M)}
+    found = block_for_each_row(body, shapes, arrays, riccati_blocks.WARPS, interpret)
+    return found["x"][..., :n, :m]

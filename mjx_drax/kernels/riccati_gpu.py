@@ -45,6 +45,9 @@ from mjx_drax.kernels.small_matrices import (
 THREADS = 32
 """Chains that a block of threads works on: one warp."""
 
+READ_AHEAD = 96
+"""Numbers of a stage that a thread reads while it works on the stage before."""
+
 MAX_NDX, MAX_NU = 6, 4
 """Largest blocks that the kernel unrolls; compiling it takes longer than it saves beyond."""
 
@@ -161,10 +164,8 @@ def backward(
     last = end.read(end_ref)
     soft = 1.0 / last["penalty"][0]
 
-    def stage(i: Array, carry: Any) -> Any:
+    def stage(k: Array, s: dict[str, Any], carry: Any) -> Any:
         P, p = carry
-        k = horizon - 1 - i
-        s = read_all(layouts, stage_refs, k)
         n = range(len(p))
         Ls = factor([[soft * P[r][c] + (1.0 if r == c else 0.0) for c in n] for r in n])
         right = [a + soft * b for a, b in zip(p, matvec(P, s["multiplier"]), strict=True)]
@@ -183,7 +184,7 @@ def backward(
         Qxx = symmetric_product(full(s["Hxx"]), A, PA)
         return symmetric_product(Qxx, Qux, K), add(qx, matvec(transpose(Qux), kff))
 
-    lax.fori_loop(0, horizon, stage, (full(last["Hxx"]), last["gx"]))
+    over_stages(horizon, layouts, stage_refs, stage, (full(last["Hxx"]), last["gx"]), True)
 
 
 def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, *refs: Any) -> None:
@@ -193,9 +194,8 @@ def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, 
     soft = 1.0 / last["penalty"][0]
     size = jnp.sqrt(soft)
 
-    def stage(k: Array, carry: Any) -> Any:
+    def stage(k: Array, s: dict[str, Any], carry: Any) -> Any:
         dx, nx = carry
-        s = read_all(layouts, stage_refs, k)
         Lu, Ls = triangular(s["Lu"]), triangular(s["Ls"])
 
         def after(x: Vector, u: Vector) -> Vector:
@@ -219,7 +219,7 @@ def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, 
 
     noisy = any("xi_u" in layout.shapes for layout in layouts)
     zero = [jnp.zeros_like(soft)] * len(last["gx"])
-    lax.fori_loop(0, horizon, stage, (zero, zero if noisy else []))
+    over_stages(horizon, layouts, stage_refs, stage, (zero, zero if noisy else []))
 
 
 def factor(A: Matrix) -> Matrix:
@@ -269,6 +269,35 @@ class Layout:
             rows = [part[i : i + width] for i in range(0, len(part), width)]
             out[name] = rows if len(shape) == 2 else part
         return out
+
+
+def over_stages(
+    horizon: int,
+    layouts: Sequence[Layout],
+    refs: Sequence[Any],
+    stage: Callable[[Array, dict[str, Any], Any], Any],
+    carry: Any,
+    backwards: bool = False,
+) -> None:
+    """stage(k, what the arrays hold there, carry), which returns the next carry, for all k.
+
+    What the next stage needs is read while this one computes, if registers can hold it: a thread
+    that has no neighbours to wait for would wait for the memory at every stage.
+    """
+    ahead = sum(layout.size for layout in layouts) <= READ_AHEAD
+
+    def place(i: Array) -> Array:
+        return horizon - 1 - i if backwards else i
+
+    def step(i: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+        k = place(i)
+        if not ahead:
+            return (), stage(k, read_all(layouts, refs, k), carry[1])
+        following = read_all(layouts, refs, place(jnp.minimum(i + 1, horizon - 1)))
+        return following, stage(k, carry[0], carry[1])
+
+    first = read_all(layouts, refs, place(jnp.int32(0))) if ahead else ()
+    lax.fori_loop(0, horizon, step, (first, carry))
 
 
 def read_all(layouts: Sequence[Layout], refs: Sequence[Any], stage: Any) -> dict[str, Any]:

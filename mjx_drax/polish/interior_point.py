@@ -26,6 +26,7 @@ Biegler, On the implementation of an interior-point filter line-search algorithm
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -34,6 +35,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.kernels.first_success import first_success
 from mjx_drax.kernels.recursion import affine_recursion
 from mjx_drax.method.bounds import Sides
 from mjx_drax.method.gauss_newton import slack_step, stage_steps, start_of, with_constraints
@@ -452,7 +454,7 @@ def _direction(
 
     Curvature that stages have `learned` (K, n, n) is left out where it makes the model indefinite:
     Gauss-Newton's alone never is, and needs no more damping. Where none is needed, none is
-    looked for: a batch takes as many tries as its chain that takes most.
+    looked for.
     """
     derivatives, multipliers = model.derivatives, model.multipliers
     assert derivatives is not None
@@ -465,7 +467,7 @@ def _direction(
     Hxx = whole.Hxx.at[1:].add(jax.vmap(jnp.diag)(curvature.x))
     Huu = whole.Huu + jax.vmap(jnp.diag)(curvature.u)
 
-    def solved(damping: Array, share: Array) -> tuple[Array, Any, Any, Any]:
+    def solved(damping: Array, share: Array) -> tuple[Array, Any]:
         damped = QuadraticCost(
             gx,
             gu,
@@ -487,19 +489,16 @@ def _direction(
         d = Trajectory(step.dx, step.du, slack, step.start)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
         finite = jnp.isfinite(sum(jnp.sum(a) for a in jax.tree.leaves((d, rates))))
-        return finite, d, rates, step.K
+        return finite, (d, rates, step.K)
 
-    def again(carry: Any) -> Any:
-        _, damping, tries = carry
-        at_once = 0 if learned is None else 1  # tries before there is more damping
-        damping = jnp.where(tries > at_once, jnp.maximum(MORE * damping, LEAST), damping)
-        return solved(damping, jnp.where(tries == 0, 1.0, 0.0)), damping, tries + 1
-
-    shapes = jax.eval_shape(solved, damping, damping)
-    nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
-    (ok, d, rates, gains), damping, _ = jax.lax.while_loop(
-        lambda carry: needed & ~carry[0][0] & (carry[2] < TRIES), again, (nothing, damping, 0)
-    )
+    more = [damping]
+    for _ in range(TRIES - 1):
+        more.append(jnp.maximum(MORE * more[-1], LEAST))
+    if learned is not None:  # the second is without what was learned, no more damping
+        more = [damping, *more[:-1]]
+    dampings, shares = jnp.stack(more), jnp.arange(TRIES) == 0
+    ok, (d, rates, gains), which = first_success(solved, (dampings, shares), needed)
+    damping = dampings[which]
     rows = rates.constraints
     of_rows = Stagewise(rows.stage / penalties.stage, rows.terminal / penalties.terminal)
     left = Multipliers(jnp.zeros_like(rates.dynamics), of_rows)
@@ -608,12 +607,13 @@ def _line_search(
         lambda alpha: problem.displaced(knots, jax.tree.map(lambda d: alpha * d, d))
     )(sizes)
 
-    def tried(new: Trajectory, _: None) -> tuple[Trajectory, Any]:
+    def tried(new: Trajectory, first: Array) -> tuple[Trajectory, Any]:
         merits = jax.vmap(lambda new: _merit(problem, new, eta, rho))(new)
-        return _bent(problem, model, gains, new, merits[2].dynamics), (new, merits)
+        bent = partial(_bent, problem, model, gains, new, merits[2].dynamics)
+        return jax.lax.cond(first, bent, lambda: new), (new, merits)
 
     # in a loop, so that f compiles once
-    both = jax.lax.scan(tried, straight, None, 2)[1]
+    both = jax.lax.scan(tried, straight, jnp.array([True, False]))[1]
     candidates, (costs, penalties, h) = jax.tree.map(
         lambda a: jnp.concatenate([a[1, :-1], a[0]]), both
     )
