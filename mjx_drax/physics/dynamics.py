@@ -338,11 +338,20 @@ class MjxDynamics(Dynamics):
 
     def observe_replayed(self, x: np.ndarray, time: float) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
+        return self.observer()(x, time)
+
+    def observer(self) -> Callable[[np.ndarray, float], mujoco.MjData]:
+        """`observe_replayed` for many states, in one MjData, which takes long to make."""
         data = mujoco.MjData(self.mj_model)
-        data.time = time
-        set_state(self.mj_model, data, x)
-        mujoco.mj_forward(self.mj_model, data)
-        return data
+
+        def observe(x: np.ndarray, time: float) -> mujoco.MjData:
+            mujoco.mj_resetData(self.mj_model, data)
+            data.time = time
+            set_state(self.mj_model, data, x)
+            mujoco.mj_forward(self.mj_model, data)
+            return data
+
+        return observe
 
 
 _TRACED = ("model", "dt", "derivatives", "time")

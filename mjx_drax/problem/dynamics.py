@@ -11,7 +11,7 @@ quaternions) brings three, `step`, `difference` and `integrate`, and `ndx`. The 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -172,6 +172,10 @@ class Dynamics:
     def observe_replayed(self, x: np.ndarray, time: float) -> Any:
         """What goal functions receive for a replayed state (nx,) at a time [s]: here the state."""
         return x
+
+    def observer(self) -> Callable[[np.ndarray, float], Any]:
+        """`observe_replayed` for many states: what it returns may change with its next call."""
+        return self.observe_replayed
 
 
 @register_dataclass

@@ -234,6 +234,11 @@ class Extended(Dynamics):
         """What goal functions receive: as from the inner system."""
         return self.inner.observe_replayed(self.inner_state(x), time)
 
+    def observer(self) -> Callable[[np.ndarray, float], Any]:
+        """`observe_replayed` for many states, of the inner system."""
+        inner = self.inner.observer()
+        return lambda x, time: inner(self.inner_state(x), time)
+
     def times(self, states: np.ndarray, t_init: float) -> np.ndarray:
         """Times of x'_0..x'_K (K + 1, nx), (K + 1,) [s]."""
         if not self.phases:

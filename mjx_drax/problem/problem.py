@@ -9,7 +9,7 @@ are solved for. There is no hidden factor dt: a running cost is summed over knot
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -375,9 +375,19 @@ class Problem:
         """
         if self.goal is None:
             return None
+        time = float(self.times[-1]) if time is None else time
+        return bool(self.all_reached(x[None], [time])[0])
+
+    def all_reached(self, x: np.ndarray, times: Sequence[float]) -> np.ndarray:
+        """`reached` of many ends x (n, nx) at their times, (n,); those not finite do not."""
+        observe = self.dynamics.observer()
+        pairs = zip(x, times, strict=True)
+        return np.array([np.isfinite(x).all() and self._met(observe, x, t) for x, t in pairs], bool)
+
+    def _met(self, observe: Callable[[np.ndarray, float], Any], x: np.ndarray, time: float) -> bool:
+        assert self.goal is not None
         try:
-            time = float(self.times[-1]) if time is None else time
-            reached = np.asarray(self.goal(self.dynamics.observe_replayed(x, time)))
+            reached = np.asarray(self.goal(observe(x, time)))
         except Exception as error:
             raise DraxError(
                 f"goal failed at x = {shown(x.tolist())}: {reason(error)}. Make it a function of "

@@ -294,9 +294,7 @@ class Family:
         if isinstance(problem.dynamics, Extended):  # each ends at a time of its own
             times, begin = problem.dynamics.times, float(problem.t_init)
             ends = [float(times(motion, begin)[-1]) for motion in states]
-        pairs = zip(states[:, -1], ends, strict=True)
-        found = [np.isfinite(x).all() and problem.reached(x, end) for x, end in pairs]
-        return np.array(found, bool)
+        return problem.all_reached(states[:, -1], ends)
 
 
 def _faults(problem: Problem) -> Array:

@@ -120,7 +120,8 @@ def replays(
         plan = np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
     ran = problem.replay(plan, u, gains)
-    return judged(Family.of_one(problem), plan, u, ran, tolerances or Tolerances())
+    extent = extents(problem, plan, u)
+    return judged(Family.of_one(problem), plan, extent, ran, tolerances or Tolerances())
 
 
 def both_ways(
@@ -134,17 +135,17 @@ def both_ways(
         u: planned controls, (n, K, nu).
         gains: feedback, (n, K, nu, ndx); see `Family.tracked`.
     """
-    which = np.arange(family.count)
+    which, extent = np.arange(family.count), extents(family.at(0), plan, u)
     open_loop = family.replay(which, plan, u, 0.0 * gains)
     found = family.tracked(which, plan, u, gains)
-    feedback = judged(family, plan, u, (found.states, found.controls), tolerances)
-    return judged(family, plan, u, open_loop, tolerances), feedback, found.gains
+    feedback = judged(family, plan, extent, (found.states, found.controls), tolerances)
+    return judged(family, plan, extent, open_loop, tolerances), feedback, found.gains
 
 
 def judged(
     family: Family,
     plan: np.ndarray,
-    u: np.ndarray,
+    extent: tuple[np.ndarray, ...],
     ran: tuple[np.ndarray, np.ndarray],
     tolerances: Tolerances,
 ) -> Replays:
@@ -152,13 +153,13 @@ def judged(
 
     Args:
         family: the problems, for their functions and bounds.
-        plan: planned states x_0..x_K, (n, K + 1, nx), and
-        u: controls (n, K, nu), whose extent gives violations their scale.
+        plan: planned states x_0..x_K, (n, K + 1, nx).
+        extent: of the plans, which gives violations their scale; from `extents`.
         ran: replayed states and controls, of the same shapes.
     """
     problem, (states, controls) = family.at(0), ran
     off = np.nan_to_num(problem.dynamics.host_difference(states, plan), nan=np.inf)
-    cost, violations = measured(family, ran, off[:, -1], extents(problem, plan, u), tolerances)
+    cost, violations = measured(family, ran, off[:, -1], extent, tolerances)
     place = KINDS.index(GOAL)
     if problem.goal is not None:
         violations.size[:, place] = ~family.reached(states)

@@ -266,10 +266,8 @@ def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
     """
     moved = problem.dynamics.host_difference(plan, np.broadcast_to(plan[:, :1], plan.shape))
     with np.errstate(invalid="ignore"):  # of plans that are not finite
-        return tuple(
-            np.nan_to_num(np.ptp(np.asarray(a, float), axis=1), posinf=0.0)
-            for a in (plan, moved, u)
-        )
+        knots_last = (np.asarray(a, float).swapaxes(1, 2).copy() for a in (plan, moved, u))
+        return tuple(np.nan_to_num(np.ptp(a, axis=2), posinf=0.0) for a in knots_last)
 
 
 def measured(

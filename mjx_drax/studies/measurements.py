@@ -50,7 +50,7 @@ from mjx_drax.search.restarts import Restarts, as_restarts
 from mjx_drax.solution.replay import Replays, judged
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
-from mjx_drax.solution.violations import Tolerances
+from mjx_drax.solution.violations import Tolerances, extents
 from mjx_drax.studies.many_starts import solve_each
 from mjx_drax.studies.other_methods import shooting
 from mjx_drax.studies.other_methods.ipopt import Transcription
@@ -226,7 +226,7 @@ def judge(problem: Problem, u: np.ndarray, x_init: np.ndarray | None = None) -> 
     """
     ran = _replayed(problem, u, x_init)
     # As if what happened had been planned
-    return judged(Family.of_one(problem), *ran, ran, Tolerances())
+    return judged(Family.of_one(problem), ran[0], extents(problem, *ran), ran, Tolerances())
 
 
 def _replayed(
