@@ -30,6 +30,14 @@ from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.attempts import (
+    Standing,
+    done_up_to,
+    noise_is_better,
+    owners_of_places,
+    stricter,
+    temperature,
+)
 from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
 from mjx_drax.search.devices import gathered, spread
@@ -49,18 +57,12 @@ from mjx_drax.search.iterate import (
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
-from mjx_drax.search.sizes import median, scale_and_floor, sizes_of
+from mjx_drax.search.sizes import scale_and_floor, sizes_of
 from mjx_drax.search.warm import Warm, warmed
 
 REPORT_EVERY = 20
 """Iterations between two reports, records of the history, and chances to interrupt; a hundredth
 of an attempt's where that is more."""
-
-STRICTER, FEW = 10.0, 0.5
-"""Factor on the scale of costs after an attempt that leaves a smaller share of chains feasible."""
-
-NEGLIGIBLE = 1e-3
-"""Differences of cost below so many scales of costs do not count."""
 
 STRAGGLERS = 0.0005
 """Share of chains for which the polish of the others does not wait."""
@@ -107,6 +109,11 @@ class Chains:
         """Feasible, and not known to be missed by their replay, (rows,)."""
         return self.feasible & ~self.missed
 
+    @property
+    def worth(self) -> np.ndarray:
+        """The cost of what is sound, and infinity of the rest, (rows,)."""
+        return np.where(self.sound, self.cost, np.inf)
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -115,6 +122,8 @@ class Stage:
 
     Attributes:
         attempt: the one that is under way, from 0.
+        heated: whether it has noise.
+        finishing: whether it goes on with what is kept instead; see `_next_attempt`.
         cost_scale: of each problem, (N,).
         floor: what costs of each problem are measured from, (N,); see `sizes`.
         todo: problems of this attempt.
@@ -123,14 +132,19 @@ class Stage:
         owners: for which of its problem's chains each row works, (rows,).
         kept: the best so far of all chains of all problems, (N * chains,); None before any.
         now: where the chunk's chains are, (rows,).
+        before: `now.worth` when it was asked last whether to wait, (rows,).
         damping: of each row between rollouts, (rows,).
         step: how many of the attempt's iterations are done.
+        ends: of a single problem, `worth` of the places when the latest attempts without and with
+            noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
         rollouts: how many rollouts, and rounds of them, are done.
         records: iterations done and diagnostics of the rows, for every report of a single problem.
         began: for every attempt, after how many iterations it began and its noise ended.
     """
 
     attempt: int
+    heated: bool
+    finishing: bool
     cost_scale: np.ndarray
     floor: np.ndarray
     todo: np.ndarray
@@ -139,8 +153,11 @@ class Stage:
     owners: np.ndarray
     kept: Chains | None
     now: Chains
+    before: np.ndarray
     damping: np.ndarray
     step: int
+    ends: np.ndarray
+    steps: np.ndarray
     rollouts: int
     records: tuple[tuple[int, Info], ...]
     began: tuple[tuple[int, int], ...] = ()
@@ -270,7 +287,7 @@ class Search:
             mine = knots if family.alone else jax.tree.map(lambda a: a[: self.chains], knots)
             flow = self.settings.first(1.0)
             require_sound(flow, one, mine, with_f=not family.problem.dynamics.checked)
-        self._settle(0, indices, scale)
+        self._settle(0, False, indices, scale)
         state = self._begun(0, knots, keys)
         zeros: Any = np.zeros(rows, knots.u.dtype)
         info = Info.of(zeros)
@@ -280,10 +297,25 @@ class Search:
         now = Chains.of(state, info, np.full(rows, -1))
         kept = None if family.alone else _unset(now, family.count * self.chains)
         owners, ones = np.tile(np.arange(self.chains), self.size), np.ones(rows)
-        records = ((0, info),)
-        floor = np.zeros(family.count)
         self.stage = Stage(
-            0, scale, floor, everyone, 0, True, owners, kept, now, ones, 0, 0, records
+            attempt=0,
+            heated=False,
+            finishing=False,
+            cost_scale=scale,
+            floor=np.zeros(family.count),
+            todo=everyone,
+            place=0,
+            begun=True,
+            owners=owners,
+            kept=kept,
+            now=now,
+            before=now.worth,
+            damping=ones,
+            step=0,
+            ends=np.full((2, self.chains), np.inf),
+            steps=np.ones(2, int),
+            rollouts=0,
+            records=((0, info),),
         )
         self._measure()
 
@@ -313,20 +345,27 @@ class Search:
         stage, indices = self.stage, self.indices
         owners = np.tile(np.arange(self.chains), self.size)
         if stage.attempt > 0:
-            assert self.settings.enough is not None
-            left_alone = self._finished()[indices] & (self.settings.enough <= 1.0)
             assert stage.kept is not None
-            shape = (self.family.count, self.chains)
-            cost = np.where(stage.kept.sound, stage.kept.cost, np.inf).reshape(shape)[indices]
-            owners = np.concatenate([_owners(*row) for row in zip(left_alone, cost, strict=True)])
+            assert self.settings.enough is not None
+            cost, bar = self._worth(stage.kept, indices), self._done_up_to(indices)
+            left_alone = (cost <= bar) & (self.settings.enough <= 1.0)
+            rows = zip(left_alone, cost, strict=True)
+            owners = np.concatenate([owners_of_places(*row) for row in rows])
         knots, keys = self._drawn(stage.attempt, indices)
-        self._settle(stage.attempt, indices, stage.cost_scale)
+        self._settle(stage.attempt, stage.heated, indices, stage.cost_scale)
         state = self._begun(stage.attempt, knots, keys)
         _, info = jax.block_until_ready(self._iterated(state, 0, 0))
         now = Chains.of(state, info, np.full(len(owners), -1))
         ones = np.ones(len(owners))
         self.stage = replace(
-            stage, begun=True, owners=owners, now=now, damping=ones, step=0, rollouts=0
+            stage,
+            begun=True,
+            owners=owners,
+            now=now,
+            before=now.worth,
+            damping=ones,
+            step=0,
+            rollouts=0,
         )
         if stage.attempt == 0:
             self._measure()
@@ -345,13 +384,17 @@ class Search:
             of_row = jax.tree.map(lambda a, mine=mine: a[mine], sizes)
             scale[index], floor[index] = scale_and_floor(of_row, self.polish is not None)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
-        self._settle(0, indices, scale)
+        self._settle(0, False, indices, scale)
 
     def _next_chunk(self) -> None:
         """Keep the best of the chunk, and go on to the next one."""
-        stage = self.stage
+        stage, kept = self.stage, self._merged()
+        ends, steps = stage.ends.copy(), stage.steps.copy()
+        if self.family.alone:
+            kind = int(stage.heated)
+            ends[kind], steps[kind] = stage.now.worth, max(stage.step, 1)
         place = min(stage.place + self.size, len(stage.todo))
-        self.stage = replace(stage, kept=self._merged(), place=place, begun=False)
+        self.stage = replace(stage, kept=kept, ends=ends, steps=steps, place=place, begun=False)
         if not self.family.alone:
             self._save()
             if self.chunk_done is not None:
@@ -359,34 +402,107 @@ class Search:
                 self.chunk_done(N - todo + place, N)
 
     def _next_attempt(self) -> bool:
-        """Go on to another attempt; False if none is to be made."""
-        stage, settings = self.stage, self.settings
-        kept, shape = stage.kept, (self.family.count, self.chains)
+        """Go on to another attempt, or finish; False if nothing more is to be done.
+
+        If attempts are `heated`, the second one is, and later ones of a single problem are if
+        that has brought more chains; in a batch, where answers must not depend on others, all are.
+        """
+        stage, settings, family = self.stage, self.settings, self.family
+        kept, everyone = stage.kept, np.arange(family.count)
         assert kept is not None
         assert settings.enough is not None
-        unfinished = (~self._finished()).sum(axis=1)
+        if stage.finishing:
+            return False
+        bar = self._done_up_to(everyone)
+        unfinished = (self._worth(kept, everyone) > bar).sum(axis=1)
         todo = np.flatnonzero(unfinished > (1.0 - settings.enough) * self.chains)
         if stage.attempt + 1 == settings.attempts or not len(todo):
-            return False
-        scale = stricter(stage.cost_scale, kept.feasible.reshape(shape))
-        self.stage = replace(stage, attempt=stage.attempt + 1, cost_scale=scale, todo=todo, place=0)
+            return self._begin_to_finish()
+        heated = bool(settings.heated)
+        if family.alone and stage.attempt > 0:
+            found = (stage.ends - stage.floor[0] <= bar[0]).sum(axis=1)
+            heated &= noise_is_better(found, stage.steps)
+        scale = stricter(stage.cost_scale, kept.feasible.reshape(family.count, self.chains))
+        self.stage = replace(
+            stage, attempt=stage.attempt + 1, heated=heated, cost_scale=scale, todo=todo, place=0
+        )
         return True
 
-    def _finished(self) -> np.ndarray:
-        """Which chains of all problems are done, (N, chains)."""
-        kept, shape = self.stage.kept, (self.family.count, self.chains)
+    def _begin_to_finish(self) -> bool:
+        """Polish on what is kept and was left early; False if there is nothing."""
+        stage, kept = self.stage, self.stage.kept
+        if not self._ends_early:
+            return False
         assert kept is not None
-        cost, sound = kept.cost.reshape(shape), kept.sound.reshape(shape)
-        cost = cost - self.stage.floor[:, None]
+        unfinished = self._unfinished(kept)
+        if not unfinished.sum() > STRAGGLERS * self.chains:
+            return False
+        least = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
+        self.stage = replace(
+            stage,
+            finishing=True,
+            begun=True,
+            place=0,
+            owners=np.arange(self.chains),
+            now=kept,
+            before=kept.worth,
+            step=self.flow.iterations + max(least, 1),  # the first only brings chains inside
+            began=(*stage.began, (stage.done, stage.done)),
+        )
+        if self.recorder is not None:
+            self.recorder.begin(self.stage.owners, continues=True)
+        self._record()
+        return True
+
+    @property
+    def _ends_early(self) -> bool:
+        """Whether attempts end early, and a finish follows: not where rollouts mend them."""
+        rollouts = self.settings.rollouts
+        assert rollouts is not None
+        return self.family.alone and bool(self.polish) and rollouts.first + rollouts.rounds == 0
+
+    def _unfinished(self, chains: Chains) -> np.ndarray:
+        """Which chains are being polished, (rows,); when finishing, if they have iterations left.
+
+        They need one more in the end, which measures their residual.
+        """
+        polish, state = self.polish, chains.state
+        assert polish is not None
+        done, active, alive = (
+            np.asarray(gathered(a, self.mesh))
+            for a in (state.polish.iterations, state.polish.active, state.alive)
+        )
+        return active & alive & (done < polish.iterations - 1)
+
+    def _worth(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
+        """Costs of those problems' chains, from their floors, (len(indices), chains)."""
+        worth = chains.worth.reshape(self.family.count, self.chains)[indices]
+        return worth - self.stage.floor[indices, None]
+
+    def _done_up_to(self, indices: np.ndarray, now: Chains | None = None) -> np.ndarray:
+        """Up to which cost, from their floors, chains of those problems are done, (n, 1).
+
+        By what is kept, and by the rows of the chunk `now`.
+        """
+        stage, kept, n = self.stage, self.stage.kept, len(indices)
+        costs, sizes = [], []
+        if kept is not None:
+            costs.append(self._worth(kept, indices))
+            sizes.append(np.asarray(kept.info.size).reshape(-1, self.chains)[indices])
+        if now is not None:
+            costs.append(now.worth.reshape(n, self.chains) - stage.floor[indices, None])
+            sizes.append(np.asarray(now.info.size).reshape(n, self.chains))
         assert self.settings.within is not None
-        size = np.asarray(kept.info.size).reshape(shape)
-        return finished(cost, sound, size, self.settings.within, self.stage.cost_scale)
+        both = np.concatenate(costs, axis=1), np.concatenate(sizes, axis=1)
+        return done_up_to(*both, self.settings.within, stage.cost_scale[indices])
 
     def _merged(self) -> Chains:
         """The best of all attempts, this one included."""
         stage, kept, now = self.stage, self.stage.kept, self._whole(self.stage.now)
         if kept is None:
             return now
+        if stage.finishing:
+            return _finished(kept, now)
         if self.family.alone:
             return best_of(kept, now, stage.owners)
         fresh = min(self.size, len(stage.todo) - stage.place)
@@ -422,22 +538,23 @@ class Search:
         shared, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
         return _drawn_by_row(own.problem, shared.problem, keys, self.chains, guess)
 
-    def _settle(self, attempt: int, indices: np.ndarray, cost_scale: np.ndarray) -> None:
+    def _settle(
+        self, attempt: int, heated: bool, indices: np.ndarray, cost_scale: np.ndarray
+    ) -> None:
         """The flow and the question of an attempt on some problems."""
-        settings, cost = self.settings, cost_scale[indices]
-        heated, flow = attempt > 0 and settings.heated, settings.flow
+        settings, flow, cost = self.settings, self.settings.flow, cost_scale[indices]
         noise = np.zeros(len(indices))
         if settings.descent is None:
             cost, noise = (np.broadcast_to(s, len(indices)) for s in vars(flow.scale).values())
-        elif not heated:
-            flow = replace(flow, iterations=settings.descent)
-        else:
+        elif heated:
             kept = self.stage.kept
             assert kept is not None
             shape = self.family.count, self.chains
             costs = kept.cost.reshape(shape) - self.stage.floor[:, None]
             rows = costs[indices], kept.feasible.reshape(shape)[indices]
             noise = np.sqrt([temperature(*row) for row in zip(*rows, cost, strict=True)])
+        elif attempt == 0 or not settings.heated:
+            flow = replace(flow, iterations=settings.descent)
         if attempt == 0 and isinstance(self.guess, Warm):
             flow = replace(flow, iterations=0)
         if self.family.alone:
@@ -474,7 +591,8 @@ class Search:
         try:
             while self.stage.step < total and self._waits(self.stage.now):
                 stage, now = self.stage, self.stage.now
-                stop = min(stage.step + self._report_every(total), total)
+                every = self._report_every(total)
+                stop = min(stage.step - stage.step % every + every, total)
                 state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
                 if stage.attempt == stage.place == stage.step == 0:
                     died_at = np.asarray(gathered(state.died_at, self.mesh))
@@ -483,8 +601,10 @@ class Search:
                         require_sound(flow, self.family.at(0), knots)
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
+                asked = stage.step % self._usual_report(total) == 0
+                worth = now.worth if asked else stage.before
                 now = Chains.of(state, info, np.where(feasible, since, -1))
-                self._report(replace(stage, now=now, step=stop), before + stop)
+                self._report(replace(stage, now=now, before=worth, step=stop), before + stop)
                 if not np.asarray(gathered(state.alive, self.mesh)).any():
                     self._require_some(now)
                     break
@@ -500,44 +620,52 @@ class Search:
             require_alive(self.flow, self.family.at(0), replace(knots, slack=None), died_at)
 
     def _waits(self, now: Chains) -> bool:
-        """Whether more than a share `STRAGGLERS` of the chains is still being polished.
+        """Whether to go on with an attempt; see `Standing`.
 
-        Where another attempt will follow, chains far more expensive than the best do not count:
-        they start again. It depends on the chains alone, so a resumed solve ends where the whole
-        one did.
+        Where a finish will follow, what is left of an attempt is polished there. Else all that
+        matters is waited for, but for a share `STRAGGLERS`. It depends on the chains alone, and is
+        asked at the usual reports only, so solves that are resumed or recorded end where others do.
+        A batch is not asked: answers would depend on what else is in it.
         """
-        if self.polish is None or self.stage.step <= self.flow.iterations:
+        stage, settings = self.stage, self.settings
+        usual = self._usual_report(self.flow.iterations + settings.after)
+        polished = self.polish is not None and stage.step > self.flow.iterations
+        if not (polished and self.family.alone and stage.step % usual == 0):
             return True
+        if stage.finishing:
+            return bool(self._unfinished(now).sum() > STRAGGLERS * self.chains)
         active = np.asarray(gathered(now.state.polish.active & now.state.alive, self.mesh))
-        hopeful = self._hopeful(now)
-        if hopeful is not None:
-            active = active & hopeful
+        if stage.attempt + 1 < settings.attempts or (self._ends_early and stage.attempt > 0):
+            bar, floor = self._done_up_to(self.indices, now).item(), stage.floor[0]
+            kept = np.zeros(self.chains, bool)
+            if stage.kept is not None:
+                kept = stage.kept.worth - floor <= bar
+            assert settings.enough is not None
+            standing = Standing(
+                owners=stage.owners,
+                active=active,
+                worth=now.worth - floor,
+                before=stage.before - floor,
+                bar=bar,
+                kept=kept,
+                needless=(1.0 - settings.enough) * self.chains,
+                iterations=stage.step,
+                since=usual,
+            )
+            if self._ends_early and standing.over:
+                return False
+            active = standing.waited_for
         return bool(active.sum() > STRAGGLERS * len(active))
 
-    def _hopeful(self, now: Chains) -> np.ndarray | None:
-        """Rows that are not far more expensive than the best; None if no attempt will follow."""
-        stage, settings, kept = self.stage, self.settings, self.stage.kept
-        if not self.family.alone or stage.attempt + 1 == settings.attempts:
-            return None
-        assert settings.enough is not None
-        assert settings.within is not None
-        costs, feasible, sizes = now.cost, now.feasible, np.asarray(now.info.size)
-        if kept is not None:  # the best may be among them
-            costs, feasible = np.append(costs, kept.cost), np.append(feasible, kept.sound)
-            sizes = np.append(sizes, kept.info.size)
-        costs = costs - stage.floor[0]
-        near = finished(costs, feasible, sizes, settings.within, stage.cost_scale[0])
-        rows = len(now.cost)
-        hopeful = near[:rows] | ~now.feasible
-        done = np.zeros(self.chains, bool) if kept is None else near[rows:]
-        done[stage.owners[hopeful]] = True
-        return hopeful if (~done).sum() > (1.0 - settings.enough) * self.chains else None
+    def _usual_report(self, total: int) -> int:
+        """Iterations between two reports of an attempt of so many."""
+        return max(REPORT_EVERY, total // 100)
 
     def _report_every(self, total: int) -> int:
-        """Iterations up to the next report, for an attempt of so many."""
+        """The same, or fewer where knots are recorded more often; all of them in a batch."""
         if not self.family.alone:  # nobody is told before a chunk is done
             return total
-        usual = max(REPORT_EVERY, total // 100)
+        usual = self._usual_report(total)
         return usual if self.recorder is None else min(usual, self.recorder.every)
 
     # Rollouts
@@ -697,7 +825,7 @@ class Search:
         if self.recorder is not None:
             self.recorder.restore(saved["recorder"])
         if not saved["ended"]:
-            self._settle(stage.attempt, self.indices, stage.cost_scale)
+            self._settle(stage.attempt, stage.heated, self.indices, stage.cost_scale)
             jax.block_until_ready(self._iterated(state, 0, 0))  # just compiles
         return saved["solve_time"], saved["ended"]
 
@@ -760,52 +888,20 @@ def _unset(like: Chains, rows: int) -> Chains:
     return replace(empty, info=worst, feasible_since=np.full(rows, -1))
 
 
-def _owners(done: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """For which chain each place works: those that are not done, the worst first, (chains,)."""
-    worst_first = np.argsort(-cost, kind="stable")
-    return np.resize(worst_first[~done[worst_first]] if not done.all() else [0], len(done))
-
-
-def stricter(cost_scale: np.ndarray, feasible: np.ndarray) -> np.ndarray:
-    """Scales of costs for a further attempt, (n,), from those so far and which chains are feasible.
-
-    Where few are, the cost of the initial knots says too little: defects are penalized more.
-    """
-    return np.where(feasible.mean(axis=1) < FEW, STRICTER * cost_scale, cost_scale)
-
-
-def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: float) -> float:
-    """The scale of the costs of answers: the best so far, or what all have if none is feasible."""
-    scale = abs(costs[feasible].min()) if feasible.any() else median(costs)
-    return max(float(scale), NEGLIGIBLE * cost_scale)
-
-
-def finished(
-    costs: np.ndarray,
-    feasible: np.ndarray,
-    sizes: np.ndarray,
-    within: float,
-    cost_scale: ArrayLike,
-) -> np.ndarray:
-    """Which chains are done, (..., chains), for one problem or several with scales (...,).
-
-    Those within a share of the best cost, measured from its floor; of its size, (..., chains),
-    where that is smaller.
-    """
-    costs = np.where(feasible, costs, np.inf)
-    best = costs.min(axis=-1, keepdims=True)
-    known = np.isfinite(best)
-    size = np.take_along_axis(sizes, costs.argmin(axis=-1, keepdims=True), axis=-1)
-    size = np.fmin(np.abs(best), size)  # sizes may be unknown, NaN
-    margin = np.maximum(within * size, NEGLIGIBLE * np.expand_dims(cost_scale, -1))
-    return np.where(known, costs <= best + np.where(known, margin, 0.0), feasible)
-
-
 def _improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
     """Which chains became sound, or cheaper by more than `CHEAPER`, (chains,)."""
     before, after = (np.asarray(a.info.cost, float) - floor for a in (kept, found))
     cheaper = after < before - CHEAPER * np.abs(before)
     return found.sound & (cheaper | ~kept.sound)
+
+
+def _finished(kept: Chains, now: Chains) -> Chains:
+    """The chains that were polished on; those kept for which it has ended worse."""
+    worse = np.where(now.sound, now.cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
+    source = np.arange(len(worse)) + len(worse) * ~worse
+    state, info = _gather((kept.state, kept.info), (now.state, now.info), source)
+    since = np.where(worse, kept.feasible_since, now.feasible_since)
+    return Chains(state, info, since, np.where(worse, kept.missed, now.missed))
 
 
 def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:

@@ -60,10 +60,14 @@ class Snapshot:
 
 @dataclass
 class Tries:
-    """One attempt: for which chain each place in the batch worked (chains,), and its snapshots."""
+    """One attempt: for which chain each place in the batch worked (chains,), and its snapshots.
+
+    If it `continues`, chains went on from where their best attempts had left them.
+    """
 
     owners: np.ndarray
     snapshots: list[Snapshot] = field(default_factory=list)
+    continues: bool = False
 
     def best(self, chain: int) -> tuple[int, tuple[bool, float]] | None:
         """The place whose end is best among those that worked for the chain, and its rank.
@@ -109,11 +113,12 @@ class Recording:
     def path(self, chain: int) -> Path:
         """The chain's tries, the best of each attempt, up to the one that gave its answer."""
         found = [(i, *best) for i, a in enumerate(self.attempts) if (best := a.best(chain))]
-        answer = min(found, key=lambda try_: try_[2])[0]  # the earliest of equals
+        tries = [one for one in found if not self.attempts[one[0]].continues]
+        answer = min(tries, key=lambda one: one[2])[0]  # the earliest of equals
         shots = [
             (attempt, place, shot)
             for attempt, place, _ in found
-            if attempt <= answer
+            if attempt <= answer or self.attempts[attempt].continues
             for shot in self.attempts[attempt].snapshots
         ]
 
@@ -143,9 +148,9 @@ class Recorder:
         self.every = int(every)
         self.attempts: list[Tries] = []
 
-    def begin(self, owners: np.ndarray) -> None:
+    def begin(self, owners: np.ndarray, continues: bool = False) -> None:
         """An attempt begins, in which each place in the batch works for the chain in owners."""
-        self.attempts.append(Tries(owners))
+        self.attempts.append(Tries(owners, continues=continues))
 
     def take(self, problem: Problem, sigma: float, done: int, z: Trajectory, info: Info) -> None:
         """A snapshot after `done` iterations of the solve, at the noise sigma."""
@@ -171,6 +176,7 @@ class Recorder:
         return {
             "every": np.array(self.every),
             "owners": np.array([tries.owners for tries in self.attempts]),
+            "continues": np.array([tries.continues for tries in self.attempts]),
             "counts": np.array([len(tries.snapshots) for tries in self.attempts]),
             **{
                 f.name: np.array([getattr(shot, f.name) for shot in shots])
@@ -184,8 +190,10 @@ class Recorder:
         shots = iter([Snapshot(int(i), float(sigma), *rest) for i, sigma, *rest in rows])
         self.every = int(saved["every"])
         self.attempts = [
-            Tries(owners, list(islice(shots, int(count))))
-            for owners, count in zip(saved["owners"], saved["counts"], strict=True)
+            Tries(owners, list(islice(shots, int(count))), bool(continues))
+            for owners, continues, count in zip(
+                *(saved[name] for name in ("owners", "continues", "counts")), strict=True
+            )
         ]
 
     def recording(self) -> Recording:

@@ -4,8 +4,9 @@ The first attempt of every chain is a noise-free flow. It solves a problem that 
 it measures what a trap's annealing needs to know: the scale of costs of answers. Each further
 attempt works on the chains that are not done: infeasible, or far more expensive than the best.
 They start again from new random knots, are heated to a temperature of that scale, and are cooled
-slowly. Chains that are done leave their places in the batch to those that are not, so an attempt
-makes several tries for each, and every chain keeps the best that was found for it.
+slowly; or they descend slowly, if on this problem that brings more (`attempts`). Chains that are
+done leave their places in the batch to those that are not, so an attempt makes several tries for
+each, and every chain keeps the best that was found for it.
 
 Schedules are multiples of scales that are measured, so no setting depends on the units of a cost:
 
@@ -91,8 +92,8 @@ class Restarts:
         enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
             where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
             finds better optima where all chains of the first attempt lead to the same ones.
-        heated: whether attempts after the first are heated, or descend like the first. None: unless
-            f has kinks.
+        heated: whether attempts after the first may be heated, or all descend like the first. None:
+            unless f has kinks.
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:

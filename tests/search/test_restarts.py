@@ -10,6 +10,7 @@ import pytest
 from builders import bouncing
 
 from mjx_drax import (
+    Constant,
     DraxError,
     GaussNewton,
     Identity,
@@ -26,7 +27,7 @@ from mjx_drax import (
 )
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
-from mjx_drax.search.engine import Chains, Search, _owners, best_of, stricter
+from mjx_drax.search.engine import Chains, Search, best_of
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, begin, iterate, partition, restart_at
@@ -85,14 +86,22 @@ def test_beyond_enough_every_chain_is_tried_again():
     assert len(further.began) == 3
 
 
-def test_the_worst_chains_get_most_places():
-    done, cost = np.array([False, True, False, False]), np.array([2.0, 1.0, np.inf, 5.0])
-    np.testing.assert_array_equal(_owners(done, cost), [2, 3, 0, 2])
+def test_what_an_attempt_leaves_early_is_polished_in_the_end():
+    endless = Polish(tolerance=1e-12, iterations=60)
+    found = search(Restarts(SHORT, attempts=2, enough=1.0, polish=endless), chains=64)
+    _, (_, noise_ends), (finish, no_noise) = found.began
+    assert finish < noise_ends + endless.iterations  # the second attempt was left early
+    assert no_noise == finish
+    polished = np.asarray(found.chains.state.polish.iterations)
+    assert (polished >= endless.iterations - 2).all()  # the first and the last take no step
+    assert found.records[-1][0] - finish < endless.iterations
 
 
-def test_defects_are_penalized_more_where_few_chains_are_feasible():
-    feasible = np.array([[True, False, False, False], [True, True, False, False]])
-    np.testing.assert_array_equal(stricter(np.array([2.0, 3.0]), feasible), [20.0, 3.0])
+def test_attempts_go_on_without_noise_where_it_brought_less():
+    flow = replace(SHORT, iterations=200, noise=Constant(1e-6))  # it only takes longer
+    found = search(Restarts(flow, descent=5, attempts=4, enough=2.0))
+    first, second, third, *_ = [ends - began for began, ends in found.began]
+    assert (first, second, third) == (0, 200, 0)
 
 
 @pytest.mark.slow

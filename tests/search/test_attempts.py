@@ -1,0 +1,97 @@
+"""Which chains are done, how long an attempt waits, and what follows it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mjx_drax.search.attempts import (
+    Standing,
+    done_up_to,
+    noise_is_better,
+    owners_of_places,
+    stricter,
+    temperature,
+)
+
+INF = np.inf
+
+
+def standing(worth, active, before=None, kept=None, owners=None, **rest):
+    worth = np.asarray(worth, float)
+    count = len(worth)
+    given = {"bar": 1.0, "needless": 0.0, "iterations": 100, "since": 20} | rest
+    return Standing(
+        owners=np.arange(count) if owners is None else np.asarray(owners),
+        active=np.asarray(active, bool),
+        worth=worth,
+        before=worth if before is None else np.asarray(before, float),
+        kept=np.zeros(count, bool) if kept is None else np.asarray(kept, bool),
+        **given,
+    )
+
+
+def test_the_worst_chains_get_most_places():
+    done, cost = np.array([False, True, False, False]), np.array([2.0, 1.0, INF, 5.0])
+    np.testing.assert_array_equal(owners_of_places(done, cost), [2, 3, 0, 2])
+
+
+def test_defects_are_penalized_more_where_few_chains_are_feasible():
+    feasible = np.array([[True, False, False, False], [True, True, False, False]])
+    np.testing.assert_array_equal(stricter(np.array([2.0, 3.0]), feasible), [20.0, 3.0])
+
+
+def test_chains_are_done_up_to_a_share_above_the_best_or_of_its_size():
+    costs = np.array([[10.0, 11.5, INF], [INF, INF, INF], [100.0, 101.0, 111.0]])
+    sizes = np.array([[np.nan] * 3, [np.nan] * 3, [5.0, 5.0, 5.0]])
+    bars = done_up_to(costs, sizes, 0.1, np.ones(3))
+    np.testing.assert_allclose(bars, [[11.0], [-INF], [100.5]])
+    bars = done_up_to(np.zeros((1, 2)), np.ones((1, 2)), 0.1, np.array([50.0]))
+    np.testing.assert_allclose(bars, [[0.05]])  # costs of no importance
+
+
+def test_all_active_places_are_waited_for_unless_another_attempt_will_be_made():
+    # the third is far too expensive, the fourth is not sound yet
+    worth, active = [0.9, 0.95, 7.0, INF], [False, True, True, True]
+    must = standing(worth, active)
+    np.testing.assert_array_equal(must.waited_for, [False, True, False, True])
+    may = standing(worth, active, needless=1.0)
+    np.testing.assert_array_equal(may.waited_for, active)
+
+
+def test_an_attempt_is_over_once_enough_chains_have_settled():
+    assert not standing([0.9, 0.9], [False, True]).over  # no other attempt would follow
+    assert not standing([0.9, 0.9], [False, True], needless=1.0).over  # nor a finish do more
+    assert standing([0.9, 0.9], [False, True], owners=[0, 0], kept=[False, True]).over
+    assert not standing([0.9, INF], [True, True], owners=[0, 0], kept=[False, True]).over
+
+
+def test_an_attempt_is_over_when_another_brings_chains_faster():
+    worth = np.array([0.9] * 40 + [7.0] * 60)
+    at = standing(worth, [True] * 100)
+    assert at.over  # none in 20 iterations, 40 in 100
+    before = np.where(np.arange(100) < 30, worth, INF)
+    assert not replace(at, before=before).over  # ten in 20
+    assert not replace(at, needless=58.0).over  # two are missing, which another cannot exceed
+    late = replace(at, iterations=1000)
+    assert not late.over  # one more in 20 is not slower than 40 in 1,000
+
+
+def test_places_that_work_for_one_chain_count_once():
+    worth, owners = [0.9, 0.9, 0.9, 7.0], [2, 2, 2, 2]
+    at = standing(worth, [False] * 4, kept=[True, True, False, True], owners=owners)
+    assert at.gained(at.near) == 1
+    assert at.missing(at.near) == 0.0
+    assert standing(worth, [False] * 4, owners=owners).missing(at.near) == 3.0
+
+
+def test_noise_goes_on_where_it_brought_as_many_chains_for_each_iteration():
+    assert noise_is_better(np.array([10, 20]), np.array([100, 200]))
+    assert not noise_is_better(np.array([10, 19]), np.array([100, 200]))
+    assert noise_is_better(np.array([0, 0]), np.array([100, 400]))
+
+
+def test_the_temperature_is_the_best_cost_and_never_negligible():
+    costs, feasible = np.array([4.0, -2.0, 1.0]), np.array([True, False, True])
+    assert temperature(costs, feasible, 1.0) == 1.0
+    assert temperature(costs, ~feasible, 1.0) == 2.0
+    assert temperature(0.0 * costs, feasible, 1.0) == 1e-3
