@@ -26,6 +26,7 @@ import numpy as np
 from jax import Array, lax
 
 from mjx_drax.kernels import elliptic_cones as elliptic
+from mjx_drax.kernels import positive_matrices
 from mjx_drax.kernels.batching import (
     block_for_each_row,
     merged_vmaps,
@@ -213,9 +214,9 @@ def _plain(given: Constraints) -> tuple[Array, Array]:
     return iterated(given, jnp.matmul, newton, jnp.zeros_like(given.M))
 
 
-def _factor(given: Constraints, a: Array) -> Array:
-    """Of the Hessian at a."""
-    return cholesky(symmetric(hessian(given, times(given.J, a) - given.aref)))
+def _hessian_at(given: Constraints, a: Array) -> Array:
+    """The Hessian at a, symmetric to the last bit."""
+    return symmetric(hessian(given, times(given.J, a) - given.aref))
 
 
 def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Array]:
@@ -229,7 +230,9 @@ def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Ar
 
     def kernel(given: Constraints) -> tuple[Array, Array]:
         a = minima(given)
-        return a, jax.vmap(_factor)(given, a)
+        H = jax.vmap(_hessian_at)(given, a)
+        small = nv <= positive_matrices.MAX_SIZE
+        return a, positive_matrices.factors(H) if small else jax.vmap(cholesky)(H)
 
     found: tuple[Array, Array] = lax.platform_dependent(given, cuda=kernel, default=plain)
     return found

@@ -1,14 +1,15 @@
 """Dense factorizations of the small blocks that a stage brings (sizes ndx and nu).
 
 Inside a batched scan an unrolled Cholesky beats the library's batched call many times over at
-sizes up to 8 (3 to 22 times on CPU). Above that, GPUs call the library. CPUs run a loop over
+sizes up to 8 (3 to 22 times on CPU). Above that, GPUs call the library, or a kernel of ours where
+equations are solved (`positive_matrices`). CPUs run a loop over
 columns: it is about as fast as LAPACK, and two batches of LAPACK calls that run at the same time
 can wait for each other forever in jaxlib's thread pool (0.10, on two cores, nearly always).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from operator import truediv
 from typing import Any
@@ -18,7 +19,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
 
-from mjx_drax.kernels import small_matrices
+from mjx_drax.kernels import positive_matrices, small_matrices
+from mjx_drax.kernels.batching import merged_vmaps, of_one_precision, on_gpu, repeated
 
 UNROLLED_UP_TO = 8
 
@@ -126,9 +128,25 @@ def solve_positive(matrix: Array, b: Array) -> Array:
     return _solve_positive(matrix, b)
 
 
-@jax.custom_jvp
-def _solve_positive(matrix: Array, b: Array) -> Array:
+def _positive_solution(matrix: Array, b: Array) -> Array:
     return solve(cholesky(matrix), b)
+
+
+def _positive_solutions(has_rows: Sequence[bool], *arguments: Array) -> Array:
+    """`_positive_solution` of many rows, by one kernel on GPUs where one is made for it."""
+    M, b = repeated(has_rows, arguments)
+    plain = jax.vmap(_positive_solution)
+    if not (on_gpu() and M.shape[-1] <= positive_matrices.MAX_SIZE and of_one_precision((M, b))):
+        return plain(M, b)
+
+    def kernel(M: Array, b: Array) -> Array:
+        return positive_matrices.solutions(M, b.reshape(*b.shape[:2], -1)).reshape(b.shape)
+
+    found: Array = jax.lax.platform_dependent(M, b, cuda=kernel, default=plain)
+    return found
+
+
+_solve_positive = jax.custom_jvp(merged_vmaps(_positive_solution, _positive_solutions))
 
 
 @_solve_positive.defjvp

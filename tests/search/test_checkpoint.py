@@ -453,7 +453,7 @@ def test_killed_by_the_system_at_random_moments(kills, whole, whole_batch, tmp_p
     random = np.random.default_rng()
 
     def written():
-        return [f.stat().st_mtime_ns for f in sorted(tmp_path.glob("*.ckpt"))]
+        return [f.stat().st_mtime_ns for f in sorted(tmp_path.glob("[!.]*.ckpt"))]
 
     for _ in range(kills):
         before, process = written(), subprocess.Popen(command)

@@ -344,7 +344,7 @@ TINY = replace(Restarts().flow, iterations=4, tail=4)
 def test_settings_that_depend_on_the_problem(balls):
     smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
     assert (smooth.within, smooth.enough, smooth.heated) == (0.1, 0.95, True)
-    assert (kinked.within, kinked.enough, kinked.heated) == (1.0, 0.6, False)
+    assert (kinked.within, kinked.enough, kinked.heated) == (1.0, 0.9, False)
     assert (smooth.rollouts, kinked.rollouts) == (NO_ROLLOUTS, Rollouts())
     assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(1e-4))
     sampled = replace(TINY, preconditioner=GaussNewton(derivatives=Smoothed()))
