@@ -94,7 +94,7 @@ class Standing:
             return False
         now, before = self.gained(self.near), self.gained(self.before <= self.bar)
         another = min(now, self.missing(self.near)) / self.iterations
-        return (now - before + 1) / self.since < another
+        return (max(now - before, 0) + 1) / self.since < another
 
 
 def done_up_to(

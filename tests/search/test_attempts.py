@@ -72,6 +72,8 @@ def test_an_attempt_is_over_when_another_brings_chains_faster():
     before = np.where(np.arange(100) < 30, worth, INF)
     assert not replace(at, before=before).over  # ten in 20
     assert not replace(at, needless=58.0).over  # two are missing, which another cannot exceed
+    fewer = standing([0.9] * 2 + [7.0] * 98, [True] * 100, before=[0.9] * 5 + [7.0] * 95)
+    assert not fewer.over  # three are not feasible for the moment
     late = replace(at, iterations=1000)
     assert not late.over  # one more in 20 is not slower than 40 in 1,000
 
