@@ -459,7 +459,8 @@ class Search:
         """Whether attempts end early, and a finish follows: not where rollouts mend them."""
         rollouts = self.settings.rollouts
         assert rollouts is not None
-        return self.family.alone and bool(self.polish) and rollouts.first + rollouts.rounds == 0
+        polished = self.polish is not None
+        return self.family.alone and polished and rollouts.first + rollouts.rounds == 0
 
     def _unfinished(self, chains: Chains) -> np.ndarray:
         """Which chains are being polished, (rows,); when finishing, if they have iterations left.

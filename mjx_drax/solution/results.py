@@ -113,7 +113,8 @@ class Results:
             every place in the batch, which in later attempts of `Restarts` hold tries for
             unfinished chains; residuals are infinite before the polish, and NaN without one;
             `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
-            its noise ended (the same, if it had none).
+            its noise ended (the same, if it had none); the last polish of what attempts have left
+            early counts as one.
         iterations: how many were done.
         compile_time, solve_time: [s].
         engine: what replayed.

@@ -138,7 +138,7 @@ PROBLEMS = {
         "x_bounds": ([-3.0, -3.0, -np.inf], [3.0, 3.0, np.inf]),
         "u_bounds": (-1.0, 1.0),
         "x_scatter": ([-3.0, -3.0, -np.pi], [3.0, 3.0, np.pi]),
-        "chains": 24,
+        "chains": 64,
         "unit": [1e3, 1e3, 1.0],
     },
     "mjcf": {
