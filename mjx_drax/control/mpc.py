@@ -35,8 +35,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,18 +56,16 @@ from mjx_drax.base.numbers import numbers
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.control.open_quantities import (
     Applied,
-    counted_from,
+    at_present,
     is_constrained,
     require_plannable,
     step_of,
-    with_time_passed,
 )
 from mjx_drax.control.shift import shifted
 from mjx_drax.kernels.compilation import compiled, keep_programs
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
-from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish, Progress, begin_inside
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
@@ -144,6 +142,31 @@ class Carried:
     spare: Array
     age: Array
     key: Array
+
+
+class Now(NamedTuple):
+    """What is new when a plan is made.
+
+    Attributes:
+        x: the state that was measured, (nx,) with the further ones.
+        t: its time [s].
+        by: knots by which the last plan is moved forward.
+        iterations: of every chain.
+        noise: unit of the explorers' noise, the root of the last plan's cost.
+        passed: time since the policy began [s].
+        data: the problem's, of the knots from t on.
+        before: the control that was applied last (nu,), and whether there is one; None without
+            rates.
+    """
+
+    x: Any
+    t: Any
+    by: Any
+    iterations: Any
+    noise: Any
+    passed: Any
+    data: Any
+    before: Any
 
 
 @dataclass
@@ -298,7 +321,10 @@ class MPC:
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
         )
-        self._traced = jax.device_put(problem)
+        settings = self._flow, self._heated, self._polish, problem
+        leaves, structure = jax.tree.flatten(settings)
+        self._settings = jax.device_put(leaves)
+        self._planner = _planner(structure, self.explorers)
         carried = _first(found.chains, self.explorers, self.seed, self._polish)
         self._plan = None
         self._apply(carried, x, t, 0.0)  # compiles
@@ -386,38 +412,33 @@ class MPC:
 
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
         """Plan in one launch, and use it if it is finite."""
-        cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
-        number = self._traced.x_init.dtype.type
-        scale = Scale(self._heated.scale.cost, number(np.sqrt(max(cost, 1e-12))))
         self._time = t  # of what is carried; the plan in use is older after one that failed
-        problem, whole = self._at(t), np.append(np.asarray(x, number), self._further)
-        if self._applied is not None:
-            v = self._applied.before(t, self._step)
-            problem = counted_from(problem, v, self._applied.any)
-            whole[len(whole) - len(v) :] = v
-        self._carried, device = _plan(
-            self._flow,
-            replace(self._heated, scale=scale),
-            self._polish,
-            problem,
-            carried,
-            whole,
-            number(by),
-            np.int32(self.iterations),
-            self.explorers,
-        )
+        self._carried, device = self._planner(self._settings, carried, self._now(x, t, by))
         plan: Plan = replace(jax.device_get(device), time=t)
         if plan.finite or self._plan is None:
             self._plan = plan
         return plan
 
-    def _at(self, t: float) -> Problem:
-        """The problem at time t [s], with its numbers on the device."""
-        moved, dynamics = self.problem.at_time(t), self.problem.dynamics
-        problem = replace(self._traced, t_init=moved.t_init, data=moved.data)
-        if isinstance(dynamics, Extended) and dynamics.phases:
-            return with_time_passed(problem, t - self._began)
-        return problem
+    def _now(self, x: ArrayLike, t: float, by: float) -> Now:
+        """What the next plan starts from, in the problem's precision."""
+        dynamics, number = self.problem.dynamics, np.asarray(self.problem.x_init).dtype.type
+        moved = self.problem if self.problem.data is None else self.problem.at_time(t)
+        cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
+        whole, before = np.append(np.asarray(x, number), self._further), None
+        if self._applied is not None:
+            v = self._applied.before(t, self._step).astype(number)
+            before = v[: dynamics.nu], np.bool_(self._applied.any)
+            whole[len(whole) - len(v) :] = v
+        return Now(
+            whole,
+            number(t),
+            number(by),
+            np.int32(self.iterations),
+            number(np.sqrt(max(cost, 1e-12))),
+            number(t - self._began),
+            moved.data,
+            before,
+        )
 
     def _begin(self, t: float) -> None:
         """Forget what was applied; a free duration begins at time t [s]."""
@@ -514,21 +535,35 @@ def _rows(state: State, which: ArrayLike) -> State:
     return jax.tree.map(lambda a: a[which], state)
 
 
-@partial(compiled, static_argnames="explorers")
-@full_precision
+@lru_cache
+def _planner(structure: Any, explorers: int) -> compiled:
+    """The program that plans with settings of this structure (flow, heated flow, polish, problem).
+
+    A call gives their leaves. A problem has more than a hundred, and to flatten it, and compare its
+    structure, takes the host longer than a GPU needs for a plan.
+    """
+
+    def plan(leaves: list[Any], carried: Carried, now: Now) -> tuple[Carried, Plan]:
+        flow, heated, polish, problem = jax.tree.unflatten(structure, leaves)
+        heated = replace(heated, scale=replace(heated.scale, noise=now.noise))
+        present = at_present(problem, now.passed, now.before)
+        present = replace(present, x_init=now.x, t_init=now.t, data=now.data)
+        return _plan(flow, heated, polish, present, carried, now.by, now.iterations, explorers)
+
+    return compiled(full_precision(plan))
+
+
 def _plan(
     flow: Langevin,
     heated: Langevin,
     polish: Polish | None,
     problem: Problem,
     carried: Carried,
-    x: Array,
     by: Array,
     iterations: Array,
     explorers: int,
 ) -> tuple[Carried, Plan]:
-    """Shift by `by` knots, iterate from x, and choose: one plan, all on the device."""
-    problem = replace(problem, x_init=x)
+    """Shift by `by` knots, iterate from x_init, and choose: one plan, all on the device."""
     chains, best, age, key = len(carried.age), carried.best, carried.age, carried.key
     exploring = jnp.arange(chains) >= chains - explorers
     state = jax.vmap(partial(shifted, flow, problem, by))(carried.state)
@@ -580,19 +615,24 @@ def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) 
     """The spare keeper's knots replaced by a rollout of the applied plan, if that was lost.
 
     After a push the knots are far from any motion, and few iterations do not bring them back. The
-    controls with their feedback, followed from x, give a motion to start from.
+    controls with their feedback, followed from x, give a motion to start from. It takes as many
+    steps as there are knots, one after the other: several times as long as an iteration.
     """
-    best = carried.best
-    knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
-    x, u = problem.rolled_out(knots, gains)
-    x, u = jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0)
-    rolled = replace(knots, x=x, u=u)
-    everyone = jax.tree.map(lambda a: jnp.broadcast_to(a, state.alive.shape + a.shape), rolled)
-    inside = jax.vmap(partial(flow.inside, problem))(everyone)
-    moved = replace(state, trajectory=inside, damping=jnp.ones_like(state.damping))
-    moved = _begun_anew(moved, state.alive)
-    which = carried.lost & (carried.spare != best) & (jnp.arange(len(state.alive)) == carried.spare)
-    return _where(which, moved, state)
+    best, spare = carried.best, carried.spare
+
+    def rolled() -> State:
+        knots, gains = jax.tree.map(lambda a: a[best], (state.trajectory, state.gains))
+        several = jax.tree.map(lambda a: a[None], (knots, gains))  # kernels are for batches
+        x, u = jax.tree.map(lambda a: a[0], jax.vmap(problem.rolled_out)(*several))
+        x, u = jnp.where(jnp.isfinite(x), x, knots.x), jnp.where(jnp.isfinite(u), u, 0.0)
+        inside = flow.inside(problem, replace(knots, x=x, u=u))
+        new = jax.tree.map(lambda a, b: a.at[spare].set(b), state.trajectory, inside)
+        which = jnp.arange(len(state.alive)) == spare
+        damping = jnp.where(which, 1.0, state.damping)
+        return _begun_anew(replace(state, trajectory=new, damping=damping), which)
+
+    led: State = jax.lax.cond(carried.lost & (spare != best), rolled, lambda: state)
+    return led
 
 
 def _restarted(
@@ -674,7 +714,8 @@ def _flowed(
     sizes = [len(jax.tree.leaves(part)) for part in question]
     differs = (True,) * sizes[0] + (False,) * sizes[1] + (True,)
     shared, rows = partition(question, differs)
-    return loop((state, rows), shared, 0, iterations, noise=explorers > 0, diagnose=False)[0]
+    both = explorers > 0
+    return loop((state, rows), shared, 0, iterations, noise=both, diagnose=False, mixed=both)[0]
 
 
 def _resumed(flow: Langevin, problem: Problem, state: State) -> State:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,22 +64,26 @@ def step_of(problem: Problem, states: Array) -> Array:
     return jnp.asarray(dynamics.dt, states.dtype)
 
 
-def with_time_passed(problem: Problem, passed: float) -> Problem:
-    """The problem with a free duration that ends no later than before, but has its least length."""
-    box = problem.bounds
-    assert box.start_lower is not None  # for the type checker
-    assert box.start_upper is not None
-    low, high = box.start_lower[-1], box.start_upper[-1]
-    most = jnp.maximum(high - passed / problem.horizon, low + WIDTH * (high - low))
-    return replace(problem, bounds=replace(box, start_upper=box.start_upper.at[-1].set(most)))
+def at_present(problem: Problem, passed: Array, before: tuple[Array, Array] | None) -> Problem:
+    """The problem when time `passed` [s] has gone since a policy began.
 
-
-def counted_from(problem: Problem, v: np.ndarray, known: bool) -> Problem:
-    """The problem with rates that are counted from the last controls (order * nu,), if known."""
-    dynamics = problem.dynamics
-    assert isinstance(dynamics, Extended)  # for the type checker
-    u_init: Any = v[: dynamics.nu].astype(problem.x_init.dtype)
-    return replace(problem, dynamics=replace(dynamics, u_init=u_init, starts_known=known))
+    A free duration ends no later than at first, but has its least length. Rates are counted from
+    the last control, `before` = (u (nu,), whether there is one); None without rates.
+    """
+    dynamics, box = problem.dynamics, problem.bounds
+    if not isinstance(dynamics, Extended):
+        return problem
+    if dynamics.phases:
+        assert box.start_lower is not None  # for the type checker
+        assert box.start_upper is not None
+        low, high = box.start_lower[-1], box.start_upper[-1]
+        most = jnp.maximum(high - passed / problem.horizon, low + WIDTH * (high - low))
+        start_upper = jnp.asarray(box.start_upper).at[-1].set(most)
+        problem = replace(problem, bounds=replace(box, start_upper=start_upper))
+    if before is not None:
+        u, known = before
+        problem = replace(problem, dynamics=replace(dynamics, u_init=u, starts_known=known))
+    return problem
 
 
 def driven(dynamics: Extended, x: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -44,11 +44,12 @@ def shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
     later = own.resampled(rows, lambda a: rows(a, place_after))
     last = problem.end.dynamics
 
-    def ahead(x: Array, _: None) -> tuple[Array, Array]:
-        x = last.step(x, knots.u[-1])
-        return x, x
+    def ahead(i: Array, beyond: Array) -> Array:
+        x = last.step(beyond[-1], knots.u[-1])
+        return jnp.where(jnp.arange(AHEAD)[:, None] < i, beyond, x)
 
-    _, beyond = jax.lax.scan(ahead, knots.x[-1], length=AHEAD)
+    steps = jnp.clip(jnp.ceil(by - 1e-3), 0, AHEAD).astype(jnp.int32)  # no more than are needed
+    beyond = jax.lax.fori_loop(0, steps, ahead, jnp.tile(knots.x[-1], (AHEAD, 1)))
     beyond = jnp.where(jnp.isfinite(beyond), beyond, knots.x[-1])
     inside = flow.bounds.interior(
         problem.bounds, Trajectory(beyond, jnp.broadcast_to(knots.u[-1], (AHEAD, dynamics.nu)))

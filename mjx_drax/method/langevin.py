@@ -145,6 +145,7 @@ class Langevin:
         tail: bool = True,
         noise: bool = True,
         moves: Array | None = None,
+        mixed: bool = False,
     ) -> tuple[State, Info]:
         """One iteration, and diagnostics of where it ends; zeros from steps with noise.
 
@@ -154,6 +155,8 @@ class Langevin:
             iteration: from 0; the schedules are read there, traced.
             tail, noise: False leaves out iterations of that kind, which must not come (static).
             moves: where this is False (traced), the chain stands still and is diagnosed.
+            mixed: some chains of a batch are in the tail, some are not: both kinds of steps are
+                computed for all, of one factorization (static).
         """
         iteration = jnp.asarray(iteration)
         noisy = iteration < self.iterations if noise else False
@@ -163,11 +166,17 @@ class Langevin:
         compute = (lambda f: f()) if moves is None else partial(where_needed, moves)
         model = compute(partial(self.model, problem, state, weights, key, tail))
 
+        def direction(key: Array | None) -> Direction:
+            return compute(lambda: metric.direction(problem, model, key, state.memory))
+
+        shared = direction(key) if mixed else None
+
         def diffuse() -> tuple[State, Info]:
-            return self.diffuse(problem, state, model, key, tail), Info.of(jnp.zeros(()))
+            to = shared or direction(key)
+            return self.diffuse(problem, state, model, to, key, tail), Info.of(jnp.zeros(()))
 
         def descend() -> tuple[State, Info]:
-            to = compute(lambda: metric.direction(problem, model, None, state.memory))
+            to = shared or direction(None)
             at = problem, self.bounds, state.trajectory, state.multipliers, weights
             X, alpha, info = descent.line_search(*at, to.drift, metric.ladder)
             new = self._moved(state, X, alpha, to)
@@ -179,16 +188,25 @@ class Langevin:
         return keep_finite(state, new, iteration, moves), info
 
     def diffuse(
-        self, problem: Problem, state: State, model: Model, key: Array, tail: bool = True
+        self, problem: Problem, state: State, model: Model, to: Direction, key: Array, tail: bool
     ) -> State:
-        """One step with noise, from the model at the chain's knots."""
-        to = self.preconditioner.direction(problem, model, key, state.memory)
-        X = self._diffused(problem, state, model, to, key, tail)
-        new = self._moved(state, X, jnp.asarray(self.step_size), to)
-        if tail:  # for which bounds have multipliers of their own, central at first
-            v = self.bounds.multipliers(problem.bounds, X, model.weights.barrier)
-            new = replace(new, multipliers=replace(new.multipliers, bounds=v))
-        return new
+        """X + alpha d + sigma sqrt(2 alpha) n, kept inside the bounds, and lambda + alpha r."""
+        alpha, X, bounds, weights = self.step_size, state.trajectory, self.bounds, model.weights
+        sigma = weights.noise * jnp.sqrt(2.0 * alpha)
+        change = jax.tree.map(lambda d, n: alpha * d + sigma * n, to.drift, to.noise)
+        new = problem.displaced(X, change)
+        if self.adjusted:
+            there = self.model(problem, replace(state, trajectory=new), weights, key, tail)
+            back = self.preconditioner.direction(problem, there, None, state.memory)
+            chain = state.multipliers, weights, alpha, (to.drift, back.drift)
+            new = descent.metropolis(problem, bounds, X, new, *chain, key)
+        else:
+            new = bounds.confine(problem.bounds, X, new)
+        moved = self._moved(state, new, jnp.asarray(alpha), to)
+        if not tail:  # in which bounds have multipliers of their own, central at first
+            return moved
+        v = bounds.multipliers(problem.bounds, new, weights.barrier)
+        return replace(moved, multipliers=replace(moved.multipliers, bounds=v))
 
     def _moved(self, state: State, X: Trajectory, alpha: Array, to: Direction) -> State:
         """The chain at X, with lambda + alpha r."""
@@ -216,23 +234,6 @@ class Langevin:
         damped = descent.with_damping(weights, state.damping)
         by, key_model = self.preconditioner.derivatives, jax.random.split(key)[0]
         return expand(problem, self.bounds, state.trajectory, present, damped, by, key_model)
-
-    def _diffused(
-        self, problem: Problem, state: State, model: Model, to: Direction, key: Array, tail: bool
-    ) -> Trajectory:
-        """X + alpha d + sigma sqrt(2 alpha) n, kept inside the bounds."""
-        alpha, X, bounds, weights = self.step_size, state.trajectory, self.bounds, model.weights
-        sigma = weights.noise * jnp.sqrt(2.0 * alpha)
-        change = jax.tree.map(lambda d, n: alpha * d + sigma * n, to.drift, to.noise)
-        new = problem.displaced(X, change)
-        if not self.adjusted:
-            return bounds.confine(problem.bounds, X, new)
-        there = self.model(problem, replace(state, trajectory=new), weights, key, tail)
-        back = self.preconditioner.direction(problem, there, None, state.memory)
-        drifts = to.drift, back.drift
-        return descent.metropolis(
-            problem, bounds, X, new, state.multipliers, weights, alpha, drifts, key
-        )
 
 
 def keep_finite(old: State, new: State, iteration: Array, moves: Array | None) -> State:

@@ -121,6 +121,7 @@ def loop(
     tail: bool = True,
     noise: bool = True,
     diagnose: bool = True,
+    mixed: bool = False,
 ) -> tuple[State, Any]:
     """Iterations start..stop-1 of every chain, and diagnostics of where they end.
 
@@ -133,13 +134,13 @@ def loop(
         rows: the chains, and what differs from row to row.
         shared: what does not.
         start, stop: iterations.
-        tail, noise: as in `Langevin.step` (static).
+        tail, noise, mixed: as in `Langevin.step` (static).
         diagnose: whether diagnostics are asked for (static); None takes their place.
     """
     states, own = rows
 
     def one(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
-        return q.flow.step(q.problem, state, i + q.offset, tail, noise, moves)
+        return q.flow.step(q.problem, state, i + q.offset, tail, noise, moves, mixed)
 
     def polished(i: Array, q: Question, state: State) -> State:
         assert q.polish is not None  # for the type checker
@@ -209,9 +210,15 @@ def diffused_or_polished(
     weights = replace(flow.weights(t), penalty=flow.weights(0.5 * t).penalty)
     model = flow.model(problem, state, weights, key, tail=False)
     last = iteration + 1 == flow.iterations + polish.iterations
+
+    def diffused() -> State:
+        own = without_units(flow, problem)
+        to = own.preconditioner.direction(problem, model, key, state.memory)
+        return own.diffuse(problem, state, model, to, key, True)
+
     new = jax.lax.cond(
         noisy,
-        lambda: without_units(flow, problem).diffuse(problem, state, model, key),
+        diffused,
         lambda: interior_point.step(problem, state, model, polish, last, guided),
     )
     return keep_finite(state, new, iteration, None)

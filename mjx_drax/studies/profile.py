@@ -2,9 +2,10 @@
 
     python -m mjx_drax.studies.profile TASK[:CHAINS] ... [--iterations N] [--rows N]
 
-For the flow and for the polish of each task: the time of an iteration, how many kernels it starts,
-the share of the time in which one of them runs, and the kernels that take longest. Taken from
-JAX's profiler, in the last of three solves of N iterations each.
+For the flow and for the polish of each task, and for plans of model predictive control: the time of
+an iteration or a plan, how many kernels it starts, the time in which one of them runs, and the
+kernels that take longest. Taken from JAX's profiler, in the last of three solves of N iterations
+each, or of three times N plans.
 """
 
 from __future__ import annotations
@@ -14,14 +15,17 @@ import gzip
 import json
 import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from mjx_drax import tasks
+from mjx_drax.control.mpc import MPC
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.restarts import Restarts, Rollouts
@@ -56,21 +60,24 @@ def busy(events: list[dict[str, Any]]) -> float:
     return total
 
 
-def measured(problem: Problem, chains: int, solver: Restarts, iterations: int, rows: int) -> None:
-    """Solve three times, and print the table of the third solve.
+def measured(run: Callable[[], tuple[int, float]], what: str, rows: int) -> None:
+    """Run three times, and print the table of the third run.
 
     It is the last one: solves after a profile have ended in launch failures.
+
+    Args:
+        run: returns how many iterations or plans there were, and their time [s].
+        what: which of the two.
+        rows: of the table.
     """
-    solve(problem, chains=chains, solver=solver, progress=False)
-    solve_time = solve(problem, chains=chains, solver=solver, seed=1, progress=False).solve_time
+    run()
+    count, seconds = run()
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder, create_perfetto_trace=True):
-            solution = solve(problem, chains=chains, solver=solver, seed=1, progress=False)
+            run()
         events = kernels(Path(folder))
-    count = max(solution.iterations, 1)
-    milliseconds = 1e3 * solve_time / count
     print(
-        f"{count} iterations of {milliseconds:.3f} ms: {len(events) / count:.0f} kernels, "
+        f"{count} {what} of {1e3 * seconds / count:.3f} ms: {len(events) / count:.0f} kernels, "
         f"busy for {busy(events) / count / 1e3:.3f} ms\n\n| kernel | times | ms |\n|---|---|---|"
     )
     sums: dict[str, list[float]] = defaultdict(list)
@@ -81,13 +88,28 @@ def measured(problem: Problem, chains: int, solver: Restarts, iterations: int, r
     print(flush=True)
 
 
+def solving(problem: Problem, chains: int, solver: Restarts) -> tuple[int, float]:
+    """Iterations of a solve, and its time [s]."""
+    solution = solve(problem, chains=chains, solver=solver, progress=False)
+    return max(solution.iterations, 1), solution.solve_time
+
+
+def planning(policy: MPC, count: int) -> tuple[int, float]:
+    """So many plans of a policy whose system stays where the last plan wants it; their time [s]."""
+    policy.rewind()
+    dt = float(policy.problem.dynamics.dt)
+    for k in range(1, count + 1):
+        policy.plan(policy.latest.x[1][: policy.problem.dynamics.given_nx], k * dt)
+    return count, sum(policy.statistics.latencies)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Profile and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("tasks", nargs="+", metavar="TASK[:CHAINS]")
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--rows", type=int, default=20)
-    parser.add_argument("--of", choices=["flow", "polish"], default=None, help="only one of them")
+    parser.add_argument("--of", choices=["flow", "polish", "plan"], help="only one of them")
     options = parser.parse_args(arguments)
     n, rows = options.iterations, options.rows
     usual = Restarts(attempts=1, rollouts=Rollouts(first=0, rounds=0))
@@ -97,11 +119,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for word in options.tasks:
         name, _, chains = word.partition(":")
         problem = tasks.load(name).make()
-        for what, solver in (("flow", flow), ("polish", polish)):
+        for what, solver in (("flow", flow), ("polish", polish), ("plan", None)):
             if options.of not in (None, what):
                 continue
             print(f"\n## {name}, {chains or 64} chains, {what}\n")
-            measured(problem, int(chains or 64), solver, n, rows)
+            if solver is not None:
+                measured(partial(solving, problem, int(chains or 64), solver), "iterations", rows)
+                continue
+            policy = MPC(problem, chains=int(chains or 64))
+            policy.reset(np.asarray(problem.x_init)[: problem.dynamics.given_nx])
+            measured(partial(planning, policy, n), "plans", rows)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from builders import DT, K, double_integrator, robot
 
 from mjx_drax import MPC, DraxError, Restarts, from_function
 from mjx_drax.control import mpc
-from mjx_drax.control.open_quantities import Applied, driven, with_time_passed
+from mjx_drax.control.open_quantities import Applied, at_present, driven
 from mjx_drax.control.shift import shifted
 from mjx_drax.search.iterate import start
 
@@ -80,7 +80,7 @@ def test_less_is_left_of_a_free_duration_but_never_less_than_the_least():
 
     @jax.jit
     def rest(passed):
-        now = with_time_passed(problem, passed)
+        now = at_present(problem, passed, None)
         later = shifted(flow, now, passed / problem.dynamics.dt, chain)
         return K * now.dynamics.extras(later.trajectory.x).h[:, 0], later.trajectory.u
 
