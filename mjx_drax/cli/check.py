@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--actuators",
         metavar="KIND[=NUMBER]",
         type=_actuators,
-        help="for a model without: torque, torque=LIMIT or position=KP",
+        help="for a model without actuators: torque, torque=LIMIT or position=KP",
     )
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 

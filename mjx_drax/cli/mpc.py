@@ -18,7 +18,7 @@ from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
 
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "chains": (at_least_1, 8, "number of chains; default 8"),
-    "explorers": (int, None, "how many of them explore; default half"),
+    "explorers": (int, None, "how many of them start again from the best plan, with noise; default half"),
     "iterations": (at_least_1, 2, "iterations of every chain for a plan; default 2"),
     "every": (at_least_1, 1, "control steps between two plans; default 1"),
     "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),

@@ -35,12 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("task", nargs="?", help=TASK)
     add("--model", metavar="XML", help="MJCF file of your own, with --cost")
     add("--cost", metavar="PY", help="Python file with the cost (see above)")
-    add("--chains", type=at_least_1, metavar="N", help="number of chains")
+    add("--chains", type=at_least_1, metavar="N", help="runs of the method, side by side; default 64 or the task's")
     add(
         "--iterations",
         type=at_least_1,
-        metavar="K",
-        help="iterations with noise of an attempt; those without noise change in proportion",
+        metavar="N",
+        help="iterations with noise of an attempt; those of the first attempt and of the tail change in "
+        "proportion, those of the polish do not",
     )
     add("--seed", type=int, default=0, metavar="S", help="of the random numbers; default 0")
     add("--horizon", type=float, metavar="SECONDS", help="duration of the motion")
