@@ -1,12 +1,13 @@
 """Times of the parts of an iteration: f, its Jacobians, the Riccati recursion, and the whole.
 
-    python -m mjx_drax.studies.iteration TASK[:CHAINS] ... [--repeats N]
+    python -m mjx_drax.studies.iteration TASK[:CHAINS] ... [--horizon S] [--repeats N]
 
 A row for each task and number of chains, in milliseconds: f at all knots, Jacobians of f at all
 knots, one recursion with noise and gains, an iteration with noise, and one of the noise-free tail,
-whose line search evaluates f several times at each knot. Times are medians of calls in one process;
-the last column is the time that all of these took to compile, in seconds. To compare two versions,
-run this file with PYTHONPATH set to either checkout.
+whose line search evaluates f several times at each knot. Plans last as long as the task's, or S
+seconds. Times are medians of calls in one process; the last column is the time that all of these
+took to compile, in seconds. To compare two versions, run this file with
+PYTHONPATH set to either checkout.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.model import linearize
 from mjx_drax.method.riccati import newton
+from mjx_drax.problem.problem import Problem
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import start
 from mjx_drax.studies.recursion import batch, timed
@@ -29,9 +31,9 @@ from mjx_drax.studies.recursion import batch, timed
 TASKS = ("quadruped_step:32", "humanoid_stand:32", "quadruped_step:1", "humanoid_stand:1")
 
 
-def times(name: str, chains: int, repeats: int) -> tuple[list[float], float]:
+def times(problem: Problem, chains: int, repeats: int) -> tuple[list[float], float]:
     """Seconds of each part, in the order of the table, and seconds to compile them all."""
-    problem, flow = tasks.load(name).make(), Langevin()
+    flow = Langevin()
     K, key = problem.horizon, jax.random.key(0)
     knots = initial_knots(problem, chains, None, key)
     states = start(flow, problem, knots, key)
@@ -57,16 +59,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Time and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("tasks", nargs="*", default=TASKS, metavar="TASK[:CHAINS]")
+    parser.add_argument("--horizon", type=float, metavar="S", help="duration of the plans [s]")
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args(arguments)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, milliseconds\n")
-    print("| task | chains | f | Jacobians | recursion | noise | tail | compile [s] |")
-    print("|---" * 8 + "|")
+    print("| task | K | chains | f | Jacobians | recursion | noise | tail | compile [s] |")
+    print("|---" * 9 + "|")
+    own = {} if options.horizon is None else {"horizon": options.horizon}
     for word in options.tasks:
         name, _, chains = word.partition(":")
-        seconds, compiling = times(name, int(chains or 32), options.repeats)
+        problem = tasks.load(name).make(**own)
+        seconds, compiling = times(problem, int(chains or 32), options.repeats)
         row = " | ".join(f"{1e3 * part:.2f}" for part in seconds)
-        print(f"| {name} | {chains or 32} | {row} | {compiling:.0f} |", flush=True)
+        print(
+            f"| {name} | {problem.horizon} | {chains or 32} | {row} | {compiling:.0f} |", flush=True
+        )
 
 
 if __name__ == "__main__":
