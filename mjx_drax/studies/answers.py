@@ -3,8 +3,8 @@
     python -m mjx_drax.studies.answers [TASK[:CHAINS] ...] [--seeds N]
 
 A row for each task and seed: the share of chains whose replay with feedback succeeds; the best and
-the median cost of those; the share of all chains within 1 % of the best, and the share that is
-optimal, with a residual below the tolerance; the share that is certified, as a replay with or
+the median cost of those; the share of all chains within 1 % of the best, and the share that has
+converged, with a residual below the tolerance; the share that is certified, as a replay with or
 without feedback succeeds; iterations; and seconds to solve and to compile. Of each task the first
 row's solve time has work that is done once in a process.
 """
@@ -33,7 +33,7 @@ DEFAULT = (
 )
 
 HEADER = (
-    "| problem | chains | seed | success | best cost | median | within 1 % | optimal | certified "
+    "| problem | chains | seed | success | best cost | median | within 1 % | converged | certified "
     "| iterations | solve [s] | compile [s] |\n" + "|---" * 12 + "|"
 )
 
@@ -44,10 +44,10 @@ def line(solution: Solution) -> str:
     costs = solution.cost[good]
     best, median = solution.cost[solution.best_chain], np.median(costs) if good.any() else np.inf
     close = (costs <= 1.01 * best).sum() / solution.chains
-    optimal = solution.residual < solution.tolerance
+    converged = solution.residual < solution.tolerance
     return (
         f"| {solution.problem.name} | {solution.chains:,} | {solution.seed} | {good.mean():.2%} "
-        f"| {best:.6g} | {median:.5g} | {close:.0%} | {optimal.mean():.1%} "
+        f"| {best:.6g} | {median:.5g} | {close:.0%} | {converged.mean():.1%} "
         f"| {solution.certified_chains.mean():.1%} | {solution.iterations} "
         f"| {solution.solve_time:.3f} | {solution.compile_time:.0f} |"
     )
