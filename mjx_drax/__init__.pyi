@@ -52,6 +52,7 @@ from .solution.violations import Tolerances as Tolerances
 from .studies.lbfgs import LBFGS as LBFGS
 from .view.browser import save_html as save_html
 from .view.diffusion import render_diffusion as render_diffusion
+from .view.plotting import plot_solution as plot_solution
 from .view.timelapse import render_timelapse as render_timelapse
 from .view.video import render as render
 from .view.video import render_comparison as render_comparison

@@ -35,7 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("task", nargs="?", help=TASK)
     add("--model", metavar="XML", help="MJCF file of your own, with --cost")
     add("--cost", metavar="PY", help="Python file with the cost (see above)")
-    add("--chains", type=at_least_1, metavar="N", help="runs of the method, side by side; default 64 or the task's")
+    add(
+        "--chains",
+        type=at_least_1,
+        metavar="N",
+        help="runs of the method, side by side; default 64 or the task's",
+    )
     add(
         "--iterations",
         type=at_least_1,

@@ -76,15 +76,27 @@ class Term:
         where: what it reads: addresses in `mjx.Data`.
         numbers: targets, `Reference`s and sizes, or the terms of a sum.
         scale: square roots of the weights, (n,) or ().
+        sizes: nq and nv of the model that it was made for, if it reads one.
     """
 
     function: Callable[..., Array] = field(metadata=Static)
     where: tuple[Any, ...] = field(metadata=Static)
     numbers: tuple[Any, ...]
     scale: Array
+    sizes: tuple[int, int] | None = field(default=None, metadata=Static)
 
     def __call__(self, data: Any, u: Array | None = None, knot: Knot | None = None) -> Array:
-        """The residual (n,), at a knot with data and control u, or at the end without u."""
+        """The residual (n,), at a knot with data and control u, or at the end without u.
+
+        Raises:
+            DraxError: it was made for another model.
+        """
+        if self.sizes is not None and self.sizes != (len(data.qpos), len(data.qvel)):
+            raise DraxError(
+                f"a term was made for a model with {self.sizes[0]} positions and {self.sizes[1]} "
+                f"velocities, but this one has {len(data.qpos)} and {len(data.qvel)}: make it with "
+                "Terms of this model."
+            )
         numbers = self.numbers if knot is None else [_at(number, knot) for number in self.numbers]
         return self.scale * self.function(data, u, self.where, *numbers)
 
@@ -164,7 +176,7 @@ class Terms:
             for q, _ in joints.quaternions:
                 _unit("posture", row[q : q + 4])
         at = self._dofs(named)
-        return _term(_posture, (joints, tuple(at)), (qpos,), "posture", len(at), weight)
+        return self._term(_posture, (joints, tuple(at)), (qpos,), "posture", len(at), weight)
 
     def velocity(
         self, joints: Names | None = None, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0
@@ -172,7 +184,7 @@ class Terms:
         """qvel [rad/s, m/s] of all joints or of the named ones, against a target of its size."""
         at = self._dofs(joints)
         wanted = _target("target of velocity", target, len(at), alike=True)
-        return _term(_read, ("qvel", tuple(at)), (wanted,), "velocity", len(at), weight)
+        return self._term(_read, ("qvel", tuple(at)), (wanted,), "velocity", len(at), weight)
 
     def control(
         self, actuators: Names | None = None, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0
@@ -182,7 +194,7 @@ class Terms:
         if actuators is not None:
             at = self._indices("actuator", actuators)
         wanted = _target("target of control", target, len(at), alike=True)
-        return _term(_control, tuple(at), (wanted,), "control", len(at), weight)
+        return self._term(_control, tuple(at), (wanted,), "control", len(at), weight)
 
     def sensor(self, name: str, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0) -> Term:
         """What a sensor reads, in its units, against a target of its size."""
@@ -190,7 +202,7 @@ class Terms:
         start, size = int(self.model.sensor_adr[sensor]), int(self.model.sensor_dim[sensor])
         wanted = _target(f"target of sensor {name!r}", target, size, alike=True)
         where = ("sensordata", tuple(range(start, start + size)))
-        return _term(_read, where, (wanted,), f"sensor {name!r}", size, weight)
+        return self._term(_read, where, (wanted,), f"sensor {name!r}", size, weight)
 
     def site(
         self,
@@ -233,7 +245,7 @@ class Terms:
         """R axis - up (3,): an axis of a body along a direction of the world, smooth everywhere."""
         at = (index(self.model, "body", body),)
         ends = [_unit(k, _numbers(k, v, 3)) for k, v in (("axis", axis), ("up", up))]
-        return _term(_upright, at, ends, f"upright {body!r}", 3, weight)
+        return self._term(_upright, at, ends, f"upright {body!r}", 3, weight)
 
     def centre_of_mass(
         self, position: ArrayLike, body: str | None = None, *, weight: ArrayLike = 1.0
@@ -241,7 +253,7 @@ class Terms:
         """Centre of mass [m] (3,) of the model, or of a body and what it carries, to a target."""
         at = 0 if body is None else index(self.model, "body", body)
         wanted = _target("position of centre_of_mass", position, 3)
-        return _term(_read, ("subtree_com", at), (wanted,), "centre_of_mass", 3, weight)
+        return self._term(_read, ("subtree_com", at), (wanted,), "centre_of_mass", 3, weight)
 
     def clearance(self, geoms: Names, others: Names, *, margin: ArrayLike = 0.0) -> Term:
         """margin - distance [m], (n,), <= 0 where geoms keep their distance: an inequality.
@@ -281,7 +293,7 @@ class Terms:
             both = zip(kinds, (firsts, seconds), strict=True)
             hulled = HULLS if MESH in kinds else ()
             used.append(tuple(hulls_of(model, g) if k in hulled else sizes[g] for k, g in both))
-        return _term(_clearance, (where, order), (wanted, *used), "clearance", len(pairs), 1.0)
+        return self._term(_clearance, (where, order), (wanted, *used), "clearance", len(pairs), 1.0)
 
     def _pose(
         self,
@@ -299,14 +311,16 @@ class Terms:
         if position is not None:
             wanted = _target(f"position of {label}", position, 3)
             where = ("site_xpos" if kind == "site" else "xpos", at)
-            parts.append(_term(_read, where, (wanted,), label, 3, weights[:3]))
+            parts.append(self._term(_read, where, (wanted,), label, 3, weights[:3]))
         if orientation is not None:
             # A site is turned by a fixed quaternion within its body, whose own is in mjx.Data.
             body, turned = at, np.array([1.0, 0.0, 0.0, 0.0])
             if kind == "site":
                 body, turned = int(model.site_bodyid[at]), model.site_quat[at]
             wanted = _quaternion(f"orientation of {label}", orientation)
-            parts.append(_term(_orientation, (body,), (wanted, turned), label, 3, weights[-3:]))
+            parts.append(
+                self._term(_orientation, (body,), (wanted, turned), label, 3, weights[-3:])
+            )
         return parts[0] if len(parts) == 1 else parts[0] + parts[1]
 
     def _dofs(self, joints: Names | None) -> list[int]:
@@ -322,6 +336,19 @@ class Terms:
         if not found:
             raise DraxError(f"no {kind} is named: give at least one name.")
         return found
+
+    def _term(
+        self,
+        function: Callable[..., Array],
+        where: tuple[Any, ...],
+        numbers: Iterable[Any],
+        label: str,
+        size: int,
+        weight: ArrayLike,
+    ) -> Term:
+        scale = jnp.sqrt(jnp.asarray(_weights(label, size, weight)))
+        values = jax.tree.map(jnp.asarray, tuple(numbers))
+        return Term(function, where, values, scale, (self.model.nq, self.model.nv))
 
 
 _DISTANCES = DISTANCES | HULL_DISTANCES
@@ -443,18 +470,6 @@ def _weights(label: str, size: int, weight: ArrayLike) -> np.ndarray:
             f"weight of {label} is {shown(weight)}: give numbers that are not negative."
         )
     return weights
-
-
-def _term(
-    function: Callable[..., Array],
-    where: tuple[Any, ...],
-    numbers: Iterable[Any],
-    label: str,
-    size: int,
-    weight: ArrayLike,
-) -> Term:
-    scale = jnp.sqrt(jnp.asarray(_weights(label, size, weight)))
-    return Term(function, where, jax.tree.map(jnp.asarray, tuple(numbers)), scale)
 
 
 def _no_distance(model: mujoco.MjModel, a: int, b: int) -> str:

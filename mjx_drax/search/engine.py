@@ -405,7 +405,9 @@ class Search:
         """Go on to another attempt, or finish; False if nothing more is to be done.
 
         If attempts are `heated`, the second one is, and later ones of a single problem are if
-        that has brought more chains; in a batch, where answers must not depend on others, all are.
+        that has brought more chains. If that is open (None), those of a single problem are in turns
+        until one has made a chain done, and then what has brought more. In a batch, where answers
+        must not depend on others, all are, or none.
         """
         stage, settings, family = self.stage, self.settings, self.family
         kept, everyone = stage.kept, np.arange(family.count)
@@ -419,9 +421,13 @@ class Search:
         if stage.attempt + 1 == settings.attempts or not len(todo):
             return self._begin_to_finish()
         heated = bool(settings.heated)
-        if family.alone and stage.attempt > 0:
+        if family.alone:
             found = (stage.ends - stage.floor[0] <= bar[0]).sum(axis=1)
-            heated &= noise_is_better(found, stage.steps)
+            better = noise_is_better(found, stage.steps)
+            if settings.heated is None:
+                heated = better if found.any() else not stage.heated
+            elif stage.attempt > 0:
+                heated &= better
         scale = stricter(stage.cost_scale, kept.feasible.reshape(family.count, self.chains))
         self.stage = replace(
             stage, attempt=stage.attempt + 1, heated=heated, cost_scale=scale, todo=todo, place=0

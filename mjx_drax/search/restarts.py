@@ -18,8 +18,9 @@ Schedules are multiples of scales that are measured, so no setting depends on th
 Costs are measured from their floor (`sizes`), so constants that are added to them change nothing.
 Where a Gauss-Newton flow is polished, states and controls are measured by their box (`scaled`).
 
-Where f has kinks (contacts, limits, dry friction), noise was never seen to help, so by default all
-attempts descend there, and `Rollouts` follow each.
+Where f has kinks (contacts, limits, dry friction), `Rollouts` follow each attempt, and noise seldom
+helps: there attempts are heated, in turns with others, only as long as none has made a chain done.
+A touch a moment later may cost much more, so all descents can end before the same narrow wall.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class Restarts:
             where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
             finds better optima where all chains of the first attempt lead to the same ones.
         heated: whether attempts after the first may be heated, or all descend like the first. None:
-            unless f has kinks.
+            they may; where f has kinks it stays None, and a single problem's are heated in turns
+            with others until a chain is done.
         rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
@@ -149,7 +151,7 @@ class Restarts:
         values: dict[str, Any] = {
             "within": WITHIN_KINKED if kinked else WITHIN,
             "enough": ENOUGH_KINKED if kinked else ENOUGH,
-            "heated": not kinked,
+            "heated": None if kinked else True,
             "rollouts": Rollouts() if kinked else Rollouts(first=0, rounds=0),
             "polish": self._polish_for(problem),
         }

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from html import escape
 
+import numpy as np
+
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Results
 from mjx_drax.solution.violations import GOAL, TRACKING, words
@@ -20,6 +22,9 @@ LOOK = (
 """Where to look if nothing is certified."""
 
 INTERRUPTED = "interrupted    the solve was ended before its time; this is the best until then"
+
+ALIKE = 0.01
+"""Costs that differ by less than this share are the same."""
 
 LABEL = 15
 """Characters of a line that name what it is about."""
@@ -105,7 +110,7 @@ def optima_lines(solution: Results) -> list[str]:
     """The cheapest of the distinct optima as a table; nothing if no chain is certified."""
     found = solution.optima
     if len(found) < 2:
-        return ["optima         one: certified chains agree on the motion"] if found else []
+        return [f"optima         {_only(solution)}"] if found else []
     outcomes = ("fails", "reaches goal")
     if solution.problem.goal is None:
         outcomes = ("fails", "keeps to plan")
@@ -125,6 +130,17 @@ def optima_lines(solution: Results) -> list[str]:
     return table
 
 
+def _only(solution: Results) -> str:
+    """What there is to say where all certified chains make one motion."""
+    costs = solution.replay_cost[solution.certified_chains]
+    if len(costs) == 1:
+        return "one: no other chain is certified"
+    return (
+        f"one: {len(costs)} certified chains make the same motion, at costs from "
+        f"{costs.min():.5g} to {costs.max():.5g}"
+    )
+
+
 def _advice(solution: Results) -> str:
     """What to try when no chain could be certified; the shell has the same names."""
     if solution.interrupted:
@@ -137,8 +153,18 @@ def _advice(solution: Results) -> str:
             f"no plan is feasible; the best {where.told(solution.problem)}. Try more iterations"
             f"{more}, or a longer horizon."
         )
+    violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
+    broken = {v.kind for v in violations if v.broken}
+    costs = solution.cost[solution.feasible]
+    alike = int(np.isclose(costs, np.median(costs), rtol=ALIKE).sum())
+    if broken <= {GOAL} and len(costs) > 2 and alike > len(costs) / 2:
+        return (
+            f"feasible chains miss the goal, {alike} of {len(costs)} at the same cost, so more "
+            "chains will hardly help. Give a guess of another motion, more weight on the terminal "
+            "cost, or heated=True."
+        )
     return (
-        "feasible chains miss the goal or break constraints when replayed. Try more chains, a "
-        "higher weight on the terminal cost, or a longer horizon; tolerances say what counts as "
-        "broken."
+        "feasible chains miss the goal or break constraints when replayed. Try a guess of the "
+        "motion, more chains, a higher weight on the terminal cost, or a longer horizon; "
+        "tolerances say what counts as broken."
     )

@@ -380,3 +380,9 @@ def test_the_example_of_the_readme():
     assert problem.reached(np.asarray(upright))
     close(problem.terminal_cost(upright), 0.0, 1e-9)
     close(problem.terminal_cost(upright.at[0].set(0.1)), 0.5)
+
+
+def test_terms_of_another_model_are_refused():
+    swing = ON.velocity()
+    with pytest.raises(DraxError, match="made for a model with 13 positions and 11 velocities"):
+        from_mjcf(ARM, horizon=0.1, terminal_residual=swing)

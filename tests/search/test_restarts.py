@@ -344,7 +344,7 @@ TINY = replace(Restarts().flow, iterations=4, tail=4)
 def test_settings_that_depend_on_the_problem(balls):
     smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
     assert (smooth.within, smooth.enough, smooth.heated) == (0.1, 0.95, True)
-    assert (kinked.within, kinked.enough, kinked.heated) == (1.0, 0.9, False)
+    assert (kinked.within, kinked.enough, kinked.heated) == (1.0, 0.9, None)
     assert (smooth.rollouts, kinked.rollouts) == (NO_ROLLOUTS, Rollouts())
     assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(1e-4))
     sampled = replace(TINY, preconditioner=GaussNewton(derivatives=Smoothed()))
@@ -355,7 +355,17 @@ def test_settings_that_depend_on_the_problem(balls):
     solver = Restarts(TINY, descent=4, attempts=2)
     found = solve(balls[1], chains=2, solver=solver).solver
     rest = {"rollouts": Rollouts(), "polish": Polish(1e-4)}
-    assert found == replace(solver, within=1.0, enough=0.9, heated=False, **rest)
+    assert found == replace(solver, within=1.0, enough=0.9, **rest)
+
+
+def test_where_f_has_kinks_noise_is_tried_in_turns_while_no_chain_is_done(balls):
+    lost = replace(balls[1], goal=lambda x: False)
+    solver = Restarts(TINY, descent=5, attempts=4, rollouts=Rollouts(first=1, rounds=0))
+    easy = replace(lost, goal=lambda x: True)
+    for problem, noisy in ((lost, [0, 4, 0, 4]), (easy, [0, 0])):
+        history = solve(problem, chains=2, solver=replace(solver, within=0.0)).history
+        lengths = (history["noise_ends"] - history["began"])[: len(noisy)]
+        np.testing.assert_array_equal(lengths, noisy)
 
 
 @pytest.mark.slow

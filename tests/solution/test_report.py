@@ -107,3 +107,19 @@ def test_a_batch_is_shown_by_its_counts_and_by_what_failed():
     assert "2 of 3 problems CERTIFIED" in lost._repr_html_()
     none = replace(found, chain_defect=np.ones((3, 2), np.float32))
     assert "0 of 3 problems CERTIFIED" in str(none)
+
+
+def test_the_advice_where_all_chains_miss_the_goal_at_the_same_cost():
+    problem = point(goal=lambda x: False)
+    made = made_up(problem, 4)
+    same = replace(made, cost=np.array([2.0, 2.001, 2.0, 5.0], np.float32)).certify()
+    assert "miss the goal, 3 of 4 at the same cost" in str(same).splitlines()[-1]
+    others = replace(same, cost=np.array([2.0, 3.0, 4.0, 5.0], np.float32))
+    assert "miss the goal or break constraints" in str(others).splitlines()[-1]
+
+
+def test_one_motion_of_one_chain_or_of_several():
+    made = made_up(point(), 2)
+    assert "2 certified chains make the same motion, at costs from 0 to 0" in str(made)
+    lost = replace(made, max_defect=np.array([0.0, 1.0], np.float32))
+    assert "one: no other chain is certified" in str(lost)
