@@ -9,6 +9,8 @@ Names are loaded when they are first used, so that importing the package costs n
 
 import os
 import sys
+from importlib import import_module
+from importlib.util import find_spec
 
 import lazy_loader
 
@@ -21,4 +23,12 @@ if "TF_CPP_MIN_LOG_LEVEL" not in os.environ or (
 ):
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """A public name, or a room such as `mjx_drax.view`."""
+    room = None if name in __all__ else find_spec(f"{__name__}.{name}")
+    if room and room.submodule_search_locations:
+        return import_module(room.name)
+    return _public(name)

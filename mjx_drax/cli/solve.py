@@ -45,8 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--iterations",
         type=at_least_1,
         metavar="N",
-        help="iterations with noise of an attempt; those of the first attempt and of the tail change in "
-        "proportion, those of the polish do not",
+        help="iterations with noise of an attempt; those of the first attempt and of the tail "
+        "change in proportion, those of the polish do not",
     )
     add("--seed", type=int, default=0, metavar="S", help="of the random numbers; default 0")
     add("--horizon", type=float, metavar="SECONDS", help="duration of the motion")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,7 +65,7 @@ def step_of(problem: Problem, states: Array) -> Array:
     return jnp.asarray(dynamics.dt, states.dtype)
 
 
-def at_present(problem: Problem, passed: Array, before: tuple[Array, Array] | None) -> Problem:
+def at_present(problem: Problem, passed: Array, before: tuple[Array, Any] | None) -> Problem:
     """The problem when time `passed` [s] has gone since a policy began.
 
     A free duration ends no later than at first, but has its least length. Rates are counted from

@@ -9,7 +9,11 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
-import importlib, mjx_drax
+import importlib, sys, mjx_drax
+assert "mjx_drax.view" not in sys.modules
+assert mjx_drax.view is sys.modules["mjx_drax.view"]
+assert not hasattr(mjx_drax, "nothing")
+assert not hasattr(mjx_drax, "__main__")
 from mjx_drax import models, tasks
 assert "cartpole_swingup" in tasks.names()
 assert models.path("cartpole").is_file()

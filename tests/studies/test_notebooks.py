@@ -43,7 +43,7 @@ def test_no_outputs_are_stored(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_first_cell_installs_what_is_missing(path):
-    assert "git+REPOSITORY" in "".join(code(path)[0]["source"])
+    assert "@ git+" in "".join(code(path)[0]["source"])
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
