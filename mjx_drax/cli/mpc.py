@@ -14,11 +14,16 @@ from typing import Any
 from mjx_drax import tasks
 from mjx_drax.base.errors import require_not_negative
 from mjx_drax.base.files import write_json
+from mjx_drax.cli import pictures
 from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
 
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "chains": (at_least_1, 8, "number of chains; default 8"),
-    "explorers": (int, None, "how many of them start again from the best plan, with noise; default half"),
+    "explorers": (
+        int,
+        None,
+        "how many of them start again from the best plan, with noise; default half",
+    ),
     "iterations": (at_least_1, 2, "iterations of every chain for a plan; default 2"),
     "every": (at_least_1, 1, "control steps between two plans; default 1"),
     "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),
@@ -51,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the simulation runs in real time and applies the newest plan",
     )
     parser.add_argument("--video", action="store_true", help="film the first run: mpc.mp4")
+    pictures.add_look(parser)
     parser.add_argument("--out", metavar="DIR", help="default out/mpc_TASK")
     parser.add_argument("--json", action="store_true", help="print mpc.json, and nothing else")
 
@@ -74,8 +80,10 @@ def run(options: argparse.Namespace) -> int:
     trials.check(options.runs, options.pushes)
     errors = {name: getattr(options, name) for name in ("mass", "noise", "shaking")}
     Plant(problem, **errors)  # refuses numbers that make no sense
+    look = pictures.look_of(options)
     if options.video:
-        require_drawing(problem)
+        seen = {name: value for name, value in look.items() if name != "caption"}
+        require_drawing(problem, **seen)
     folder = writable(options.out or Path("out") / f"mpc_{problem.name}")
     tell = say_nothing if options.json else say
     tell(f"{problem.name}: K = {problem.horizon} knots, {options.chains} chains; compiling ...")
@@ -90,7 +98,8 @@ def run(options: argparse.Namespace) -> int:
     numbers = {**trials.summary(), "push": options.push, "hold": options.hold, **errors}
     written = [write_json(folder / "mpc.json", numbers).name]
     if options.video:
-        written.append(runs.film(problem, trials.motions[0], folder / "mpc.mp4").name)
+        film = runs.film(problem, trials.motions[0], folder / "mpc.mp4", **look)
+        written.append(film.name)
     for line in runs.lines(numbers):
         tell(line)
     tell(f"written to {folder}/: {', '.join(written)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,51 @@ NAMES = (
     "film.mp4",
 )
 """All that there may be."""
+
+LOOK = ("camera", "size", "fps", "speed", "caption")
+"""What a user may say about videos and films."""
+
+
+def add_look(parser: argparse.ArgumentParser) -> None:
+    """An option for each of `LOOK`; None where nothing is said."""
+    add = parser.add_argument
+    add(
+        "--camera",
+        metavar="NAME",
+        help="a camera of the model; free: one that shows the whole motion; follow: one that goes "
+        "with the robot; default follow where it travels far, else free",
+    )
+    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]")
+    add("--fps", type=float, metavar="N", help="frames per second; default 30")
+    add("--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion")
+    add(
+        "--no-caption",
+        dest="caption",
+        action="store_false",
+        default=None,
+        help="no text under videos and films",
+    )
+
+
+def _size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT as (width, height)."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT, such as 640x480")
+    return int(width), int(height)
+
+
+def look_of(options: argparse.Namespace) -> dict[str, Any]:
+    """What the user says of `LOOK`."""
+    given = {name: getattr(options, name) for name in LOOK}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def in_folder(folder: str) -> list[Path]:
+    """Those of `NAMES` that lie in a folder, videos first."""
+    videos_first = sorted(NAMES, key=lambda name: not name.endswith(".mp4"))
+    paths = [Path(folder).expanduser() / name for name in videos_first]
+    return [path for path in paths if path.exists()]
 
 
 def film_path(asked: str, folder: Path) -> Path:

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 __doc__ += cost_file.HELP
 
-LOOK = ("camera", "size", "fps", "speed", "caption")
-"""What a user may say about videos and films."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to solve, how, and what to write."""
@@ -65,22 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also film how the knots of all chains become a motion: .mp4, .gif or .webp; "
         "default DIR/film.mp4",
     )
-    add(
-        "--camera",
-        metavar="NAME",
-        help="a camera of the model; free: one that shows the whole motion; follow: one that goes "
-        "with the robot",
-    )
-    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of videos and films [pixels]")
-    add("--fps", type=float, metavar="N", help="frames per second; default 30")
-    add("--speed", type=float, metavar="S", help="of the motion; 0.5 is slow motion")
-    add(
-        "--no-caption",
-        dest="caption",
-        action="store_false",
-        default=None,
-        help="no text under videos and films",
-    )
+    pictures.add_look(parser)
     add(
         "--side-by-side",
         action="store_true",
@@ -144,14 +126,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
 
-def _size(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT as (width, height)."""
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT, such as 640x480")
-    return int(width), int(height)
-
-
 def run(options: argparse.Namespace) -> int:
     """Solve, save and draw; what cannot work is refused before anything compiles."""
     if options.task is not None:
@@ -181,7 +155,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
         each.check(problem)
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
-    look = {name: getattr(options, name) for name in LOOK if getattr(options, name) is not None}
+    look = pictures.look_of(options)
     seen = {name: value for name, value in look.items() if name != "caption"}
     if look or options.film is not None or options.side_by_side:
         require_drawing(problem, draw=None if options.side_by_side else draw, **seen)

@@ -211,7 +211,14 @@ def lines(numbers: dict[str, Any]) -> list[str]:
     ]
 
 
-def film(problem: Problem, motion: Motion, path: str | os.PathLike[str], **look: Any) -> Path:
+def film(
+    problem: Problem,
+    motion: Motion,
+    path: str | os.PathLike[str],
+    *,
+    caption: bool = True,
+    **look: Any,
+) -> Path:
     """A film of one run, with an arrow while a push lasts; see `view.video.render_motion`."""
     from mjx_drax.view.scene import posed
     from mjx_drax.view.video import render_motion
@@ -235,4 +242,5 @@ def film(problem: Problem, motion: Motion, path: str | os.PathLike[str], **look:
                 found.append((centre - vector, vector))  # it ends where it pushes
         return found
 
-    return render_motion(model, qpos, motion.times, path, overlay=lines_, arrows=arrows, **look)
+    overlay = lines_ if caption else []
+    return render_motion(model, qpos, motion.times, path, overlay=overlay, arrows=arrows, **look)

@@ -19,7 +19,7 @@ from mjx_drax.problem.tracing import require_functions
 from mjx_drax.search.iterate import FEASIBLE
 
 COMPILING = "{desc}: compiling, first iterations [{elapsed}]"
-FORMAT = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+FORMAT = "{l_bar}{bar}| {n_fmt}%s{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
 
 def reporting(
@@ -85,7 +85,7 @@ class Bar:
         bar = self._bar
         if not self._compiled.is_set():
             self._stop_clock()
-            bar.bar_format = FORMAT
+            bar.bar_format = FORMAT % ("/" if info is None else " of at most ")
             bar.reset(total)
             bar.initial = done
         if info is not None:
@@ -97,9 +97,9 @@ class Bar:
         bar.update(done - bar.n)
 
     def __exit__(self, *_: object) -> None:
-        bar, told = self._bar, self._compiled.is_set()
+        bar = self._bar
         self._stop_clock()
-        if told:
-            bar.total = bar.n  # fewer iterations than expected were enough
-            bar.refresh()
+        # Nothing remains, whether fewer iterations were enough or Ctrl-C ended them.
+        bar.bar_format = str(bar.bar_format).replace("<{remaining}", "")
+        bar.refresh()
         bar.close()

@@ -68,8 +68,8 @@ BEST_KNOWN = {
     "cartpole_swingup": 0.22190,
     "acrobot_swingup": 0.22473,
 }
-"""Lowest costs of certified and optimal answers over the seeds of docs/benchmarks.md, with this
-version. They are local optima: a lower one may exist, and then `cost_ratio` is below 1."""
+"""Lowest costs of certified and optimal answers that were ever found, not only with default
+settings. They are local optima: a lower one may exist, and then `cost_ratio` is below 1."""
 
 NEAR = 2.0
 """How many times the best known cost still counts as near it."""

@@ -22,7 +22,7 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.states import finite, set_state
 from mjx_drax.solution.replay import OPEN_LOOP
 from mjx_drax.view.geoms import Floats, Surface, mean_color, surface_of
-from mjx_drax.view.scene import Scene, camera_for, posed
+from mjx_drax.view.scene import FREE, Scene, camera_for, posed
 
 if TYPE_CHECKING:
     import viser
@@ -189,8 +189,13 @@ class Shape:
 
 
 def shapes_of(model: mujoco.MjModel, qpos: Floats, server: viser.ViserServer) -> list[Shape]:
-    """What MuJoCo's viewer shows of the model; the page's camera is that of videos."""
-    drawn = Scene(model, camera_for(model, qpos, None, 16 / 9))
+    """What MuJoCo's viewer shows of the model; the page's camera sees the motion qpos (T, nq).
+
+    One pose says nothing about the motion to come: then it is the camera "main", if there is one.
+    """
+    main = mujoco.mj_name2id(model, _OBJECT.mjOBJ_CAMERA, "main") >= 0
+    wanted = "main" if main and len(qpos) == 1 else FREE
+    drawn = Scene(model, camera_for(model, qpos, wanted, 16 / 9))
     drawn.begin(qpos[0])
     _point_camera(server, drawn.content, model)
     bodies = {

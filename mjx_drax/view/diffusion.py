@@ -87,7 +87,7 @@ def render_diffusion(
         parts, which take long to draw without a GPU.
       chains: number of chains whose paths are shown, those of distinct optima first.
       fps, size, speed, caption: as in `render`.
-      camera: a camera of the model, see `motion_frames`; None sees all that is shown.
+      camera: as in `render`; None sees all that is shown.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes, one line of
         it with a vertex for each state; needed for problems without a model.
 

@@ -27,11 +27,14 @@ Frame = npt.NDArray[np.uint8]
 UNCERTIFIED = "NOT CERTIFIED"
 """These words in a caption turn it red."""
 
+DARK = (20, 25, 33)
+"""Color of the strip under a frame, and of what stands between two of them."""
+
 SUFFIXES = (".mp4", ".gif", ".webp")
 
 _CLOCK = "00.00 s"  # where the time will stand
 _LETTERS = 30  # letters of a caption are this share of the height
-_LONG = 32  # a longer text of a caption may be broken [characters]
+_LONG = 40  # a longer text of a caption may be broken [characters]
 _CRF = 28  # H.264 quality: a quarter of the default's size, without visible loss
 _WEBP_QUALITY = 60
 
@@ -130,7 +133,7 @@ def captioned(frame: Frame, lines: Sequence[str], time: float, below: int) -> Fr
     height, width = len(frame) + below, frame.shape[1]
     font, rows = _fitted(tuple(lines), height, below, width)
     red = any(UNCERTIFIED in line for line in lines)
-    image = Image.new("RGB", (width, below), (120, 22, 22) if red else (20, 25, 33))
+    image = Image.new("RGB", (width, below), (120, 22, 22) if red else DARK)
     text = "\n".join(rows).replace(_CLOCK, f"{time:.2f} s")
     gap = font.size // 2
     ImageDraw.Draw(image).multiline_text((gap, gap), text, (240, 243, 247), font, spacing=gap // 2)

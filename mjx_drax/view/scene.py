@@ -25,7 +25,8 @@ Arrow = tuple[Floats, Floats]
 """A point and a vector from it, (3,) each [m]."""
 
 _MARGIN = 1.1  # factor on the free camera's distance
-_FAR = 3.0  # a robot travels far if its way is so many times its size
+_ROOM = 2.0  # the same for one that follows, so that one sees where the robot goes
+_FAR = 8.0  # a robot travels far if its way is so many times its size
 _SUN = np.array([0.4, 0.5, -1.0])  # where light comes from in a model without lights: its direction
 _RED = np.array([0.85, 0.15, 0.1, 1.0])
 _POSES = 240  # so many poses of a motion decide where the free camera stands
@@ -45,6 +46,8 @@ class Scene:
         kinds = mujoco.mjtCatBit
         kind = kinds.mjCAT_STATIC if qpos is None else kinds.mjCAT_ALL
         set_pose(self._model, self.data, self._model.qpos0 if qpos is None else qpos)
+        # First the camera: planes without end are centred on the one that was there before.
+        mujoco.mjv_updateCamera(self._model, self.data, self._camera, self.content)
         mujoco.mjv_updateScene(
             self._model, self.data, self._option, None, self._camera, kind.value, self.content
         )
@@ -149,15 +152,15 @@ def camera_for(
 ) -> mujoco.MjvCamera:
     """The camera asked for, for a motion qpos (T, nq) in frames of an aspect, width / height.
 
-    `wanted` is a camera's name or index, `FREE` or `FOLLOW`; None is the camera "main", or else
-    `FREE`, or `FOLLOW` where the robot travels far.
+    `wanted` is a camera's name or index, `FREE` or `FOLLOW`; None is `FREE`, or `FOLLOW` where the
+    robot travels far.
 
     Raises:
       DraxError: there is no such camera.
     """
     names = [model.camera(index).name for index in range(model.ncam)]
     if wanted is None:
-        wanted = "main" if "main" in names else FOLLOW if _travels_far(model, qpos) else FREE
+        wanted = FOLLOW if _travels_far(model, qpos) else FREE
     if wanted in (FREE, FOLLOW) and wanted not in names:
         return _free_camera(model, qpos, aspect, follows=wanted == FOLLOW)
     index = names.index(wanted) if wanted in names else wanted
@@ -233,7 +236,7 @@ def _free_camera(
         reach = (np.abs(offset - shift[i]) * np.cos(angle) + bound) / np.sin(angle) - depth
         distance = max(distance, float(reach.max()))
     camera.lookat[:] = center + shift @ axes[:2]
-    camera.distance = _MARGIN * distance
+    camera.distance = (_MARGIN if body is None else _ROOM) * distance
     return camera
 
 

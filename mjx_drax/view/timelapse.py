@@ -41,7 +41,7 @@ def render_timelapse(
       path: where to, ending in .png; its folder is made if need be.
       count: number of poses, the last one included.
       size: (width, height) [pixels].
-      camera: a camera of the model, see `motion_frames`; None frames the motion.
+      camera: as in `render`; None frames the motion.
       chain, plan: as in `render`: the best chain by default, and its plan instead of the replay.
       draw: as in `render`, for problems without a model: the picture is what it draws of the whole
         motion, and `count` and `camera` have no meaning.

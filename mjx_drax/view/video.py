@@ -23,6 +23,7 @@ from mjx_drax.solution.results import optimality
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
+    DARK,
     UNCERTIFIED,
     Frame,
     caption_height,
@@ -35,6 +36,7 @@ from mjx_drax.view.renderer import open_renderer
 from mjx_drax.view.scene import Arrow, Scene, camera_for
 
 _HOLD = 0.5  # [s] the last frame stays this long
+_BETWEEN = 4  # columns of pixels between a plan and its replay
 
 
 def render(
@@ -60,7 +62,9 @@ def render(
       path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       fps: frames per second.
       size: (width, height) [pixels].
-      camera: a camera of the model, see `motion_frames`.
+      camera: the name or index of a camera of the model; "free" for one that sees the whole
+        motion, "follow" for one that goes with the robot. Both look along the model's camera
+        "main", if there is one. By default "follow" where the robot travels far, else "free".
       speed: of the motion; 0.5 is slow motion.
       draw: draw(axes, states (k + 1, nx)) draws the motion x_0..x_k on matplotlib axes; needed
         for problems without a model (others do not use it).
@@ -113,7 +117,8 @@ def render_comparison(
     told = outcome_lines(solution, chain, brief=True)
     overlay = [told[0], "left: plan, right: replay", *told[1:]]
     below = caption_height([overlay], height, width)
-    half = 2 * (width // 4)
+    half = (width - _BETWEEN) // 2
+    between = np.full((height - below, _BETWEEN, 3), DARK, np.uint8)
     both = [states_of(solution, chain, plan)[:, : model.nq] for plan in (True, False)]
     seen = camera_for(model, np.concatenate(both), camera, half / (height - below))
     times = solution.times_of(chain)
@@ -127,7 +132,9 @@ def render_comparison(
                 for qpos in both:
                     scene.begin(interpolated(model, qpos, times[: len(qpos)], time))
                     sides.append(renderer.render(scene.content))
-                yield captioned(np.concatenate(sides, axis=1), overlay, time, below)
+                plan, replay = sides
+                frame = np.concatenate([plan, between, replay], axis=1)
+                yield captioned(frame, overlay, time, below)
 
     return write(path, frames(), fps)
 
@@ -198,9 +205,7 @@ def motion_frames(
       overlay: texts in a strip under each frame; `{time}` becomes the frame's time.
       fps: frames per second.
       size: (width, height) [pixels]; odd ones are made even, which players ask for.
-      camera: a camera's name or index; "free" is one that sees the whole motion, "follow" one
-        that goes with the robot. None takes the one called "main"; in a model without one the free
-        one, or, for a robot that travels far, the one that follows.
+      camera: as in `render`.
       speed: of the motion; 0.5 is slow motion.
       arrows: gives what is drawn besides at a time [s], such as pushes.
 

@@ -73,7 +73,7 @@ def show(
         DraxError: viser is not installed, the problem has no model, or the port is in use.
     """
     require_viewer(solution.problem)
-    with server_at(_checked(port)) as server:
+    with server_at(checked_port(port)) as server:
         told(f"open {_address(server)} in a browser; Ctrl-C ends it")
         _play(server, solution, until or threading.Event())
 
@@ -82,7 +82,8 @@ def _address(server: viser.ViserServer) -> str:
     return f"http://127.0.0.1:{server.get_port()}"
 
 
-def _checked(port: int) -> int:
+def checked_port(port: int) -> int:
+    """The port, if it can be one."""
     require_whole("port", port, 0)
     if port > 65535:
         raise DraxError(f"port is {port}: give a number from 1 to 65535, or 0 for any.")
@@ -196,7 +197,7 @@ def live_page(
         DraxError: as `show`.
     """
     require_viewer(problem)
-    with server_at(_checked(port)) as server:
+    with server_at(checked_port(port)) as server:
         live = Live(server, problem, every)
         told(f"open {_address(server)} in a browser")
         yield live

@@ -1,5 +1,6 @@
 """The command line, in this process; the heavy commands with the smallest sizes that still work."""
 
+import argparse
 import errno
 import importlib.util
 import json
@@ -9,13 +10,15 @@ import subprocess
 import sys
 from dataclasses import replace
 from inspect import signature
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builders import At
 
 from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
-from mjx_drax.cli import cost_file, main, pictures
+from mjx_drax.cli import cost_file, main, mpc, pictures
+from mjx_drax.control import trials
 from mjx_drax.physics.report import text
 from mjx_drax.search.engine import REPORT_EVERY
 
@@ -250,6 +253,38 @@ def test_export_writes_what_is_asked_for(slider, tmp_path, capsys):
     assert (tmp_path / "keyframes.xml").stat().st_size > 1000
     assert "--dataset" in error_of(capsys, "export", str(tmp_path))
     assert "nowhere" in error_of(capsys, "export", str(tmp_path / "nowhere"), "--csv")
+
+
+def test_view_shows_the_pictures_of_a_problem_without_a_model(tmp_path, capsys, monkeypatch):
+    folder = At(tmp_path).saved("point_answer")
+    assert "no pictures beside its result" in error_of(capsys, "view", str(folder))
+    for name in ("plot.png", "video.mp4", "other.png"):
+        (folder / name).touch()
+    seen = []
+    monkeypatch.setattr(
+        "mjx_drax.view.picture_page.show_pictures", lambda _, files, **__: seen.extend(files)
+    )
+    assert main(["view", str(folder)]) == 0
+    assert [path.name for path in seen] == ["video.mp4", "plot.png"]
+
+
+def test_a_run_of_mpc_is_filmed_as_asked_for(slider, tmp_path, monkeypatch):
+    motion = SimpleNamespace(times=np.linspace(0, 1, 11), states=np.zeros((11, 2)), pushes=())
+    films = []
+    monkeypatch.setattr("mjx_drax.view.video.render_motion", lambda *_, **look: films.append(look))
+    parser = argparse.ArgumentParser()
+    mpc.add_arguments(parser)
+    for words in ("", "--fps 5 --size 160x120 --camera free --speed 2 --no-caption"):
+        look = pictures.look_of(parser.parse_args(["cartpole", *words.split()]))
+        trials.film(slider.problem, motion, tmp_path / "mpc.mp4", **look)
+    usual, asked = films
+    assert usual.pop("overlay")[0] == "slider, model predictive control"
+    assert asked.pop("overlay") == []
+    assert set(usual) == {"arrows"}
+    del asked["arrows"]
+    assert asked == {"fps": 5, "size": (160, 120), "camera": "free", "speed": 2}
+    with pytest.raises(SystemExit):
+        main(["mpc", "cartpole", "--size", "640"])
 
 
 def test_an_exporter_of_your_own_is_given_by_its_name(slider, tmp_path, capsys, monkeypatch):

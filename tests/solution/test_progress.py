@@ -52,7 +52,17 @@ def test_the_bar_tells_compiling_then_the_best_feasible_cost(monkeypatch, capsys
         bar(40, 100, INFO)
     shown = capsys.readouterr().err
     assert "best cost 5, feasible 50%" in shown
-    assert shown.strip().split("\r")[-1].startswith("arm: 100%")  # 40 of 40: no more were needed
+    last = shown.strip().split("\r")[-1]  # whether the 40 were enough or interrupted
+    assert last.startswith("arm:  40%")
+    assert "40 of at most 100 [" in last
+    assert "<" not in last  # nothing remains to wait for
+
+
+def test_a_further_attempt_raises_the_bound(capsys):
+    with Bar("arm") as bar:
+        bar(100, 100, INFO)
+        bar(120, 200, INFO)
+    assert "120 of at most 200" in capsys.readouterr().err
 
 
 def test_an_error_while_it_compiles_ends_the_bar_and_its_clock(monkeypatch, capsys):
@@ -66,7 +76,7 @@ def test_a_batch_counts_problems(capsys):
     with Bar("problems") as bar:
         bar(3, 9)
         bar(9, 9)
-    assert "9/9" in capsys.readouterr().err
+    assert "100%|██████████| 9/9 [" in capsys.readouterr().err
 
 
 @pytest.mark.slow

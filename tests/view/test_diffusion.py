@@ -279,7 +279,7 @@ def test_slow_motion_and_the_free_camera() -> None:
     assert near.azimuth == pytest.approx(90.0)  # as the camera "main" looks
     assert 0.4 < near.lookat[0] < 0.8
     assert far.distance > 1.5 * near.distance
-    assert scene.camera_for(model, poses, None, 1.3).fixedcamid == 0
+    assert scene.camera_for(model, poses, "main", 1.3).fixedcamid == 0
 
 
 def test_what_a_solve_could_not_film_is_refused_before_it() -> None:

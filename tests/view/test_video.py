@@ -24,6 +24,7 @@ from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 from mjx_drax.view import renderer, video
 from mjx_drax.view.frames import caption_height
+from mjx_drax.view.scene import camera_for
 
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 120, 160
@@ -138,15 +139,39 @@ def test_the_robot_is_where_its_angle_says(
         ("cartpole", [[x, a] for x in (-1.8, 1.8) for a in (0.0, np.pi / 2, np.pi, -np.pi / 2)]),
     ],
 )
-def test_the_main_camera_sees_every_pose(name: str, poses: list[list[float]], backend: str) -> None:
-    frames = video.render_frames(
-        _model(name), poses, range(len(poses)), fps=1, size=(WIDTH, HEIGHT)
-    )
+@pytest.mark.parametrize("camera", ["main", None])
+def test_every_pose_is_seen(
+    name: str, poses: list[list[float]], camera: str | None, backend: str
+) -> None:
+    look = {"fps": 1, "size": (WIDTH, HEIGHT), "camera": camera}
+    frames = video.render_frames(_model(name), poses, range(len(poses)), **look)
     for frame in frames:
         seen = _amber(frame)
         assert np.any(seen)
         border = np.concatenate([seen[0], seen[-1], seen[:, 0], seen[:, -1]])
         assert not np.any(border)
+
+
+def test_by_default_the_motion_fills_the_frame(backend: str) -> None:
+    poses = [[0.0, 0.0], [0.2, np.pi / 2], [0.0, np.pi]]
+    share = []
+    for camera in ("main", None):
+        look = {"fps": 1, "size": (WIDTH, HEIGHT), "camera": camera}
+        frames = video.render_frames(_model("cartpole"), poses, range(3), **look)
+        rows = np.argwhere([_amber(frame) for frame in frames])[:, 1]
+        share.append(np.ptp(rows) / HEIGHT)
+    assert share[0] < 0.4
+    assert 0.75 < share[1] < 0.95
+
+
+@pytest.mark.parametrize(("way", "follows"), [(2.0, False), (4.0, True)])
+def test_the_camera_goes_with_a_robot_that_travels_far(way: float, follows: bool) -> None:
+    """The car, with what belongs to it, is 0.8 m long."""
+    model = _model("car_bug_trap")
+    qpos = np.array([[x, -2.0, 0.0] for x in np.linspace(-way, way, 5)])
+    seen = camera_for(model, qpos, None, 4 / 3)
+    kinds = mujoco.mjtCamera.mjCAMERA_FREE, mujoco.mjtCamera.mjCAMERA_TRACKING
+    assert seen.type == kinds[follows]
 
 
 @pytest.mark.parametrize("name", ["pendulum", "acrobot", "cartpole"])
