@@ -28,7 +28,8 @@ _public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> object:
     """A public name, or a room such as `mjx_drax.view`."""
-    room = None if name in __all__ else find_spec(f"{__name__}.{name}")
+    known = name in __all__ or not name.isidentifier()
+    room = None if known else find_spec(f"{__name__}.{name}")
     if room and room.submodule_search_locations:
         return import_module(room.name)
     return _public(name)

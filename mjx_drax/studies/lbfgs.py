@@ -129,10 +129,10 @@ class LBFGS(Metric):
 @register_dataclass
 @dataclass(frozen=True)
 class Matrix:
-    """M^{-1} (n, n), and whether it has met a pair; the rest as in `Memory`."""
+    """M^{-1} (n, n), and its scale s'y / y'y, 0 before the first pair; the rest as in `Memory`."""
 
     inverse: Array
-    began: Array
+    scale: Array
     point: Trajectory
     gradient: Array
     count: Array
@@ -144,26 +144,37 @@ class BFGS(LBFGS):
     """Drift -M^{-1} grad L_mu with the full matrix M^{-1} of BFGS; `pairs` has no meaning here.
 
     M^{-1} <- (I - s y'/s'y) M^{-1} (I - y s'/s'y) + s s'/s'y. A chain takes n² numbers.
+
+    Rounding can cost M its positive definiteness: after a step that was no descent M begins anew
+    from the identity, of the last pair's scale. The line search takes its smallest step even
+    uphill, so steps are no longer than `longest`: from far away multipliers do not come back.
+
+    Attributes:
+        longest: the largest norm of a step.
     """
+
+    longest: float = 10.0
 
     def memory(self, problem: Problem, trajectory: Trajectory) -> Any:
         """The identity."""
         zero = ravel_pytree(problem.no_change(trajectory))[0]
         none = jnp.zeros((), jnp.int32)
-        return Matrix(jnp.eye(zero.shape[0]), jnp.zeros((), bool), trajectory, zero, none)
+        return Matrix(jnp.eye(zero.shape[0]), jnp.zeros(()), trajectory, zero, none)
 
     def _with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
-        scale = product / jnp.maximum(jnp.dot(y, y), 1e-30)  # of the first matrix
-        inverse = jnp.where(memory.began, memory.inverse, scale * memory.inverse)
+        scale = jnp.where(good, product / jnp.maximum(jnp.dot(y, y), 1e-30), memory.scale)
+        anew = (memory.scale == 0.0) | (jnp.dot(s, memory.gradient) > 0.0)
+        inverse = jnp.where(anew, scale * jnp.eye(s.shape[0]), memory.inverse)
         moved = inverse @ y
         factor = (1.0 + jnp.dot(y, moved) / product) / product
         cross = jnp.outer(moved, s) / product
         new = inverse + factor * jnp.outer(s, s) - cross - cross.T
-        return replace(
-            memory, inverse=jnp.where(good, new, memory.inverse), began=memory.began | good
-        )
+        return replace(memory, inverse=jnp.where(good, new, inverse), scale=scale)
 
     def _inverse_times(self, memory: Any, gradient: Array) -> Array:
-        """M^{-1} times the gradient; before the first pair a step of unit length."""
-        length = jnp.maximum(jnp.linalg.norm(gradient), 1e-12)
-        return jnp.where(memory.began, memory.inverse @ gradient, gradient / length)
+        """M^{-1} times the gradient, cut to `longest`; before the first pair of unit length."""
+        began = memory.scale > 0.0
+        step = jnp.where(began, memory.inverse @ gradient, gradient)
+        length = jnp.linalg.norm(step)
+        most = jnp.where(began, jnp.minimum(length, self.longest), 1.0)
+        return step * most / jnp.maximum(length, 1e-12)

@@ -15,6 +15,7 @@ controls that attain the minimum.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ from jax.scipy.ndimage import map_coordinates
 from mjx_drax import tasks
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.batch import BatchSolution, solve_batch
+from mjx_drax.solution.progress import reporting
 
 ANGLES, VELOCITIES, CONTROLS = (60.0, 6001), (14.0, 1401), 41
 """Reach and number of the grid's points: some states can but turn over and over."""
@@ -72,8 +74,11 @@ def values(
         return moved[jnp.argmin(costs, axis=0), jnp.arange(len(x))]
 
     V = [jax.vmap(problem.terminal_cost)(grid)]
-    for _ in range(problem.horizon):
-        V.append(backwards(V[-1]))
+    with reporting(None, "dynamic programming, knots") as report:
+        for k in range(problem.horizon):
+            V.append(jax.block_until_ready(backwards(V[-1])))
+            if report is not None:
+                report(k + 1, problem.horizon)
     found, state = interpolated(V[-1], jnp.asarray(x)), jnp.asarray(x)
     for k in range(problem.horizon):
         state = forwards(V[problem.horizon - 1 - k], state)
@@ -103,6 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     problem = tasks.load("pendulum").make()
     x = np.random.default_rng(0).uniform(-4, 4, (options.states, 2)).astype(np.float32)
+    grid = f"{ANGLES[1]} x {VELOCITIES[1]} states"
+    print(f"dynamic programming on {grid}, then {options.states} solves a row", file=sys.stderr)
     best, can = values(problem, x)
     print(
         f"{jax.devices()[0].device_kind}: {can.mean():.1%} of the states can be upright\n{HEADER}"

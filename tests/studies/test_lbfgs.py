@@ -1,5 +1,7 @@
 """The matrices of the quasi-Newton baselines."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,7 @@ def problem():
     )
 
 
-@pytest.mark.parametrize("metric", [BFGS(), LBFGS(pairs=12)])
+@pytest.mark.parametrize("metric", [BFGS(longest=1e3), LBFGS(pairs=12)])
 def test_n_pairs_of_a_quadratic_give_its_inverse(problem, metric):
     n = 12
     key = jax.random.key(0)
@@ -38,3 +40,15 @@ def test_n_pairs_of_a_quadratic_give_its_inverse(problem, metric):
     gradient = np.arange(1.0, n + 1.0)
     step = metric._inverse_times(memory, jnp.asarray(gradient, jnp.float32))
     np.testing.assert_allclose(step, np.linalg.solve(hessian, gradient), rtol=2e-3, atol=2e-3)
+
+
+def test_a_full_matrix_without_descent_begins_anew(problem):
+    """The last pair's scale s'y / y'y is 1/2 here, so M^{-1} = I / 2; long steps are cut."""
+    n, metric = 12, BFGS(longest=10.0)
+    memory = metric.memory(problem, Trajectory(jnp.zeros((3, 2)), jnp.zeros((3, 2))))
+    s = jnp.zeros(n).at[0].set(1.0)
+    gradient = jnp.ones(n)  # s goes uphill
+    lost = replace(memory, inverse=-jnp.eye(n), scale=jnp.asarray(0.5), gradient=gradient)
+    memory = metric._with_pair(lost, s, -2.0 * s, jnp.asarray(1.0), jnp.asarray(False))
+    np.testing.assert_allclose(metric._inverse_times(memory, gradient), 0.5 * gradient)
+    np.testing.assert_allclose(jnp.linalg.norm(metric._inverse_times(memory, 1e6 * gradient)), 10.0)

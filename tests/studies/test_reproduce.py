@@ -79,10 +79,10 @@ def test_convergence_has_a_curve_for_every_penalty():
 
 @pytest.mark.slow
 def test_bug_trap_gives_every_method_the_same_budget():
-    numbers, figure = bug_trap.make(chains=4, iterations=30, longer=2)
+    numbers, figure = bug_trap.make(chains=4, iterations=30, longer=2, matrix=True)
     budgets = {row["method"]: row["iterations"] for row in numbers["rows"]}
     long = {name for name in budgets if name.endswith("2×")}
-    assert len(long) == 3
+    assert len(long) == 4
     assert {budgets[name] for name in long} == {60}
     assert {budgets[name] for name in set(budgets) - long} == {30}
     assert numbers["settings"]["gradient descent"].noise.start == 0.0
@@ -91,7 +91,7 @@ def test_bug_trap_gives_every_method_the_same_budget():
 
 @pytest.mark.slow
 def test_parallel_table_solves_a_problem_for_each_initial_state():
-    numbers, figure = parallel_table.make(chains=4, iterations=50, sizes=(4, 8))
+    numbers, figure = parallel_table.make(4, 50, sizes=(4, 8), grid=(601, 201))
     assert [(row["N"], row["x_init"]) for row in numbers["rows"]] == [
         (4, "random"),
         (4, "hanging"),
@@ -99,6 +99,9 @@ def test_parallel_table_solves_a_problem_for_each_initial_state():
     hanging = numbers["rows"][-1]
     assert hanging["preconditioned: rollout upright"] == 1.0
     assert hanging["paper's flow: rollout upright"] == 0.0  # not after 50 iterations
+    assert hanging["can be upright"] == 1.0
+    assert hanging["preconditioned: projected: upright"] == 1.0
+    assert hanging["preconditioned: of those that can"] == 1.0
     assert hanging["preconditioned: time [s]"] > 0
     assert "| 4 | hanging |" in table(numbers)
     assert figure_is_drawn(figure)
@@ -133,12 +136,17 @@ def test_theorem_2_where_the_answer_is_known():
 
 @pytest.mark.slow
 def test_theorem_2_at_the_pendulums_optimum():
-    numbers, figure = theorem_2.make(2, 500, barriers=(1e-2,), penalties=(1.0, 10.0))
-    (row,) = numbers["rows"]
+    numbers, figure = theorem_2.make(2, 500, barriers=(1e-2, 1e-1), penalties=(1.0, 10.0))
+    row, unstable = numbers["rows"]
+    assert unstable["largest α, μ = 10"] is None
     assert 150 < row["mu* (A positive definite)"] < 250
     assert 0.3 < row["linearized flow stable from mu"] < 1.0
     assert 0.030 < row["largest α, μ = 10"] < 0.035
-    assert [energy["rises with μ|h|²"] for energy in numbers["energies"]] == [0.0, 0.0]
+    rises = {(energy["rho"], energy["mu"]): energy for energy in numbers["energies"]}
+    assert rises[0.01, 1.0]["rises with μ|h|²"] == rises[0.01, 10.0]["rises with μ|h|²"] == 0.0
+    assert (
+        rises[0.1, 1.0]["energy left (the proof's)"] > rises[0.01, 1.0]["energy left (the proof's)"]
+    )
     assert figure_is_drawn(figure)
 
 

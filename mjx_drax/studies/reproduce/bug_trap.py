@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_drax import tasks
 from mjx_drax.method.langevin import Langevin
+from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.lbfgs import BFGS
@@ -19,58 +21,50 @@ from mjx_drax.studies.reproduce.output import Numbers, reaching, solve_row, tell
 from mjx_drax.studies.reproduce.settings import NO_NOISE, with_budget
 from mjx_drax.view.plotting import BLACK, BLUE, GREEN, VERMILLION, new_figure
 
-FULL = {"chains": 256}
-"""Sizes with --full: those of the numbers in docs/paper.md."""
+FULL = {"chains": 256, "matrix": True}
+"""Sizes with --full. docs/paper.md has 32 chains, and 10 of the row that `matrix` adds."""
 
-FIRST_ORDER = "gradient descent", "quasi-Newton", "paper's flow"
+FIRST_ORDER = "gradient descent", "L-BFGS", "paper's flow"
+
+MATRIX = "BFGS, full matrix"
+
+BROKEN: dict[str, Any] = {"ls": "", "marker": "x", "ms": 2.5, "mew": 0.5, "color": "0.65"}
+"""How the knots are drawn at which an infeasible chain breaks the dynamics; a line through them
+would look like a path."""
 
 STYLES: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("infeasible: breaks the dynamics", {"color": "0.3", "lw": 1.0, "ls": ":"}),
+    (f"infeasible: knots with |h| > {FEASIBLE:g}", BROKEN),
     ("feasible, does not reach the goal", {"color": VERMILLION, "lw": 1.2}),
     ("feasible, reaches the goal", {"color": BLUE, "lw": 1.2}),
 )
-"""Outcomes of a chain: its label and how its path is drawn."""
+"""Outcomes of a chain: its label and how it is drawn."""
 
 
 def make(
-    chains: int = 32, iterations: int | None = None, longer: int = 50
+    chains: int = 32, iterations: int | None = None, longer: int = 50, matrix: bool = False
 ) -> tuple[Numbers, Figure]:
     """The same knots, and the same budget of iterations, for every method.
 
     The budget is by default that of the preconditioned settings. First-order methods have rows for
     `longer` times as much too, because one of their iterations costs less; these are drawn, as the
-    paper draws them.
+    paper draws them. With `matrix` so has BFGS with a full matrix, which takes the longest.
     """
     problem = tasks.load("bug_trap").make()
     budget = iterations or settings.budget_of(settings.TRAP)
-    solvers = _methods(budget, longer)
+    solvers = _methods(budget, longer, matrix)
     start = settings.initial_knots(problem, chains)
     solutions = {}
-    for name, solver in solvers.items():
-        tell(f"bug-trap: {name}, {settings.budget_of(solver):,} iterations")
-        solutions[name] = solve(problem, chains, solver=solver, guess=start, progress=False)
+    for i, (name, solver) in enumerate(solvers.items()):
+        count = f"{i + 1} of {len(solvers)}"
+        tell(f"bug-trap, {count}: {name}, {settings.budget_of(solver):,} iterations")
+        solutions[name] = solve(problem, chains, solver=solver, guess=start)
     rows = {name: solve_row(name, solution) for name, solution in solutions.items()}
-    figure = new_figure(10.2, 5.0)
-    drawn = [f"{name}, {longer}×" for name in FIRST_ORDER]
-    for i, name in enumerate(drawn):
-        axes = figure.add_subplot(1, len(drawn), i + 1)
-        _draw_paths(axes, solutions[name])
-        axes.set_title(
-            f"({'abc'[i]}) {FIRST_ORDER[i]}\n{_outcome(rows[name])}", loc="left", fontsize=8
-        )
-        if i == 0:
-            for label, style in STYLES:
-                axes.plot([], [], label=label, **style)
-            axes.plot([], [], color=BLACK, lw=2.2, label="the best")
-            axes.set_ylabel("y [m]", fontsize=8)
-            figure.legend(loc="outside lower center", ncols=len(STYLES) + 2, fontsize=8)
-    figure.suptitle(
-        f"Bug trap, K = {problem.horizon}, {chains} chains from the same knots", fontsize=10
-    )
+    drawn = {name: f"{name}, {longer}×" for name in FIRST_ORDER}
+    figure = _draw({name: (solutions[long], rows[long]) for name, long in drawn.items()})
     return {"rows": list(rows.values()), "budget": budget, "settings": solvers}, figure
 
 
-def _methods(budget: int, longer: int) -> dict[str, Langevin]:
+def _methods(budget: int, longer: int, matrix: bool) -> dict[str, Langevin]:
     """The methods that are compared, each with a budget of iterations."""
     flow, diffusion = settings.TRAP_FLOW, with_budget(settings.TRAP, budget)
     full = replace(settings.TRAP_QUASI_NEWTON, preconditioner=BFGS())
@@ -78,14 +72,32 @@ def _methods(budget: int, longer: int) -> dict[str, Langevin]:
     first_order = dict(zip(FIRST_ORDER, solvers, strict=True))
     return {
         **{name: with_budget(solver, budget) for name, solver in first_order.items()},
-        "quasi-Newton, full matrix": with_budget(full, budget),
+        MATRIX: with_budget(full, budget),
         "preconditioned, no noise": replace(diffusion, noise=NO_NOISE),
         "preconditioned diffusion": diffusion,
         **{
             f"{name}, {longer}×": with_budget(solver, longer * budget)
-            for name, solver in first_order.items()
+            for name, solver in {**first_order, **({MATRIX: full} if matrix else {})}.items()
         },
     }
+
+
+def _draw(found: dict[str, tuple[Solution, Numbers]]) -> Figure:
+    """A panel for each method's solution and row."""
+    figure = new_figure(10.2, 5.0)
+    panels = figure.subplots(1, len(found), sharey=True)
+    for letter, axes, (name, (solution, row)) in zip("abc", panels, found.items(), strict=True):
+        _draw_paths(axes, solution)
+        axes.set_title(f"({letter}) {name}\n{_outcome(row)}", loc="left", fontsize=8)
+    for label, style in STYLES:
+        panels[0].plot([], [], label=label, **{**style, "ms": 5, "mew": 1.0})
+    panels[0].plot([], [], color=BLACK, lw=2.2, label="the best")
+    panels[0].set_ylabel("y [m]", fontsize=8)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
+    horizon, chains = solution.problem.horizon, solution.chains
+    figure.suptitle(f"Bug trap, K = {horizon}, {chains} chains from the same knots", fontsize=10)
+    return figure
 
 
 def _draw_paths(axes: Axes, solution: Solution) -> None:
@@ -97,8 +109,11 @@ def _draw_paths(axes: Axes, solution: Solution) -> None:
     axes.contourf(side, side, shade, levels=20, cmap="Reds", vmax=1.3 * shade.max())
     escaped = reaching(solution)
     paths, feasible = solution.plans, solution.feasible
-    outcomes = ~feasible, feasible & ~escaped, escaped
-    for chosen, (_, style) in zip(outcomes, STYLES, strict=True):
+    h = np.abs(jax.vmap(solution.problem.defects)(solution.trajectories)).max(axis=-1)
+    broken = paths[:, 1:][~feasible][h[~feasible] > FEASIBLE]
+    axes.plot(*broken[:, :2].T, **BROKEN)
+    outcomes = feasible & ~escaped, escaped
+    for chosen, (_, style) in zip(outcomes, STYLES[1:], strict=True):
         for path in paths[chosen]:
             axes.plot(path[:, 0], path[:, 1], **style)
     best = paths[solution.best_chain]

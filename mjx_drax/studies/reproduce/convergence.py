@@ -18,6 +18,7 @@ from mjx_drax.method.schedules import Constant
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
+from mjx_drax.solution.progress import reporting
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
 from mjx_drax.studies.reproduce.output import Numbers, tell
@@ -81,9 +82,12 @@ def followed(
     solver = replace(flow, penalty=Constant(mu), step_size=step)
     state = start(solver, problem, settings.initial_knots(problem, chains), jax.random.key(0))
     squares = [np.asarray(_square(problem, state.trajectory))]
-    for begin, end in pairwise(stops):
-        state, _ = advance(solver, problem, state, int(begin), int(end))
-        squares.append(np.asarray(_square(problem, state.trajectory)))
+    with reporting(None, f"μ = {mu:g}") as report:
+        for begin, end in pairwise(stops):
+            state, _ = advance(solver, problem, state, int(begin), int(end))
+            squares.append(np.asarray(_square(problem, state.trajectory)))
+            if report is not None:
+                report(int(end), int(stops[-1]))
     defect = np.asarray(evaluate(problem, state.trajectory).max_defect)
     upright = judge(problem, np.asarray(state.trajectory.u, float)).success
     return (

@@ -46,7 +46,7 @@ def make(
     """
     problem = tasks.load("pendulum").make()
     flow = settings.pendulum_flows(iterations)["paper's flow"]
-    stops = np.array([0, int(flow.iterations)])
+    stops = np.unique(np.linspace(0, int(flow.iterations), 21).round().astype(int))
     kinds: dict[str, Metric] = {"with multipliers": Identity(), "without": PenaltyOnly()}
     rows = []
     for mu in penalties:

@@ -20,6 +20,7 @@ from mjx_drax.problem.differentiators import Smoothed
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import FEASIBLE, advance, evaluate, start
+from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.solve import solve
 from mjx_drax.studies.measurements import judge
 from mjx_drax.studies.reproduce import settings
@@ -162,12 +163,15 @@ def _annealed(
     state = start(solver, problem, initial_knots(problem, chains), jax.random.key(0))
     noisy = int(solver.iterations)
     stops, values, sigma = list(range(0, noisy, EVERY)), [], 0.0
-    for i in stops:
-        cost = np.asarray(evaluate(problem, state.trajectory).cost)
-        sigma = float(rule(i / max(stops[-1], 1), sigma, cost))
-        values.append(sigma)
-        now = replace(solver, noise=Geometric(sigma, sigma))
-        state, _ = advance(now, problem, state, i, min(i + EVERY, noisy))
+    with reporting(None, "bug trap") as report:
+        for i in stops:
+            cost = np.asarray(evaluate(problem, state.trajectory).cost)
+            sigma = float(rule(i / max(stops[-1], 1), sigma, cost))
+            values.append(sigma)
+            now = replace(solver, noise=Geometric(sigma, sigma))
+            state, _ = advance(now, problem, state, i, min(i + EVERY, noisy))
+            if report is not None:
+                report(min(i + EVERY, noisy), noisy)
     quiet = replace(solver, noise=settings.NO_NOISE)
     state, _ = advance(quiet, problem, state, noisy, budget_of(solver))
     return state.trajectory, stops, values

@@ -15,6 +15,7 @@ Numbers = dict[str, Any]
 
 SHARES = (
     "upright",
+    "can be upright",
     "of those that can",
     "within 1.2 times dynamic programming",
     "feasible",

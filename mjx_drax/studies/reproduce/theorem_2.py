@@ -123,10 +123,10 @@ def make(
     barriers: Sequence[float] = (1e-4, 1e-3, 1e-2, 1e-1),
     penalties: Sequence[float] = (0.1, 1.0, 10.0, 100.0),
 ) -> tuple[Numbers, Figure]:
-    """mu* over rho, steps and rates of decay over mu, and energies from starts near the optimum.
+    """mu* over rho, steps and rates of decay over mu, and energies from starts near each optimum.
 
     There are `chains` starts, whose energy is followed for 4,000 iterations by default; barriers
-    are values of rho, rising, penalties values of mu.
+    are values of rho, rising, penalties values of mu. Energies are drawn for the first rho.
     """
     with jax.enable_x64(True):
         problem = tasks.load("pendulum").make()
@@ -146,8 +146,15 @@ def make(
                     "slowest mode, μ = 10, α = 0.025, per iteration": optimum.decay(10.0, 0.025),
                 }
             )
-        tell("theorem-2: energies")
-        energies = _energies(functions, optima[0], chains, iterations or 4000, penalties)
+        energies = {}
+        for optimum, row in zip(optima, rows, strict=True):
+            tell(f"theorem-2: energies at ρ = {optimum.rho:g}")
+            names = {mu: f"largest α, μ = {mu:g}" for mu in penalties}
+            # where no step is stable, that of the first ρ shows how the energy grows
+            steps = {mu: 0.2 * (row[key] or rows[0][key] or 0.0) for mu, key in names.items()}
+            energies[f"{optimum.rho:g}"] = _energies(
+                functions, optimum, chains, iterations or 4000, steps
+            )
     figure = new_figure(9.0, 3.6)
     left, right = figure.subplots(1, 2)
     weights = [row["rho"] for row in rows]
@@ -156,33 +163,37 @@ def make(
     label_axes(left, "barrier weight ρ", "penalty μ")
     left.set_title("pendulum: where theorem 2 holds", loc="left", fontsize=9)
     left.legend(fontsize=7)
-    for (mu, curve), color in zip(energies.items(), CURVES, strict=False):
+    drawn = energies[f"{barriers[0]:g}"]
+    for (mu, curve), color in zip(drawn.items(), CURVES, strict=False):
         for name, style in (("the proof's", "--"), ("with μ|h|²", "-")):
             label = f"μ = {mu}" if style == "-" else None
             right.semilogy(curve["iteration"], curve[name], style, color=color, lw=1.2, label=label)
     right.plot([], [], "--", color=BLACK, label="the proof's |v|²/2 + |h|²/2")
     right.plot([], [], "-", color=BLACK, label="|v|²/2 + μ |h|²")
     label_axes(right, "iteration", "energy, relative to the first")
-    right.set_title(f"energy from near the optimum, ρ = {optima[0].rho:g}", loc="left", fontsize=9)
+    right.set_title(f"energy from near the optimum, ρ = {barriers[0]:g}", loc="left", fontsize=9)
     right.legend(fontsize=7)
     rises = [
         {
+            "rho": float(rho),
             "mu": float(mu),
             "step size": curve["step size"],
-            "rises of the proof's energy": _rises(curve["the proof's"]),
-            "rises with μ|h|²": _rises(curve["with μ|h|²"]),
+            "rises of the proof's energy": curve["rises"][0],
+            "rises with μ|h|²": curve["rises"][1],
             "energy left (the proof's)": curve["the proof's"][-1],
         }
-        for mu, curve in energies.items()
+        for rho, of_rho in energies.items()
+        for mu, curve in of_rho.items()
     ]
     flow = settings.PENDULUM_FLOW
     return {"rows": rows, "energies": rises, "series": energies, "settings": {"flow": flow}}, figure
 
 
-def _rises(energy: Sequence[float]) -> float:
-    """The share of steps in which an energy rises."""
-    values = np.asarray(energy)
-    return float(np.mean(np.diff(values) > 1e-12 * values[:-1]))
+def _rises(energy: np.ndarray) -> np.ndarray:
+    """The share of steps in which an energy (iterations, ...) rises, as long as it is finite."""
+    known = np.isfinite(energy[1:])
+    rises = known & (np.diff(energy, axis=0) > 1e-12 * energy[:-1])
+    return np.asarray(rises.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
 
 
 class _Functions:
@@ -217,16 +228,17 @@ class _Functions:
         """The largest share of a step that uses up at most 0.9 of every slack."""
         share = 1.0
         for end in map(self.flat, self._problem.bounds.sides(self._knots(jnp.asarray(z)))):
-            toward = (end - z) * np.sign(step)
-            moves = np.isfinite(end) & (toward > 0)
-            share = np.min(0.9 * toward[moves] / np.abs(step[moves]), initial=share)
+            known = np.isfinite(end)  # before products: inf times 0 is no number
+            change, toward = step[known], (end - z)[known] * np.sign(step[known])
+            moves = toward > 0
+            share = np.min(0.9 * toward[moves] / np.abs(change[moves]), initial=share)
         return float(share)
 
 
 def _optimum(functions: _Functions, problem: Problem, rho: float) -> Optimum:
     """The cheapest of a few solves with a barrier of weight rho, refined by Newton's method."""
     solver = replace(DESCENT, barrier_weight=Constant(rho))
-    found = solve(problem, 4, seed=1, solver=solver, precision=64, progress=False)
+    found = solve(problem, 4, seed=1, solver=solver, precision=64)
     best = int(np.argmin(np.where(found.feasible, found.cost, np.inf)))
     knots = jax.tree.map(lambda a: jnp.asarray(a[best]), found.trajectories)
     lambda_ = np.asarray(found.multipliers.dynamics[best]).ravel()
@@ -258,9 +270,12 @@ def _energies(
     optimum: Optimum,
     chains: int,
     iterations: int,
-    penalties: Sequence[float],
+    steps: dict[float, float],
 ) -> dict[str, Any]:
-    """Both energies, the mean over the chains, along the flow without noise."""
+    """Both energies, the mean over the chains, along the flow without noise.
+
+    `steps` has a step size alpha for every mu.
+    """
     random = np.random.default_rng(0).normal(size=(chains, functions.size))
     z = jnp.asarray(optimum.z)
     starts = jnp.stack([z + functions.slack(optimum.z, NEAR * r) * NEAR * r for r in random])
@@ -281,12 +296,12 @@ def _energies(
         )[1]
 
     found, every = {}, max(1, iterations // 400)
-    for mu in penalties:
-        alpha = 0.2 * (optimum.largest_step(mu) or 0.0)
+    for mu, alpha in steps.items():
         values = np.asarray(run(jnp.asarray(alpha), jnp.asarray(mu)))
         values = values / values[0]
         found[f"{mu:g}"] = {
             "step size": alpha,
+            "rises": _rises(values).tolist(),
             "iteration": list(range(0, iterations, every)),
             "the proof's": values[::every, 0].tolist(),
             "with μ|h|²": values[::every, 1].tolist(),
