@@ -128,6 +128,7 @@ def test_stages_learn_the_curvature_of_a_quadratic_lagrangian_in_as_many_steps_a
     np.testing.assert_allclose(stage_blocks(added) - stage_blocks(cost), one.B, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_from_standing_still_or_from_rounding():
     problem = posed(quadratic)
     secant = learned(problem, N)[0]

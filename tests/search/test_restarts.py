@@ -97,6 +97,7 @@ def test_what_an_attempt_leaves_early_is_polished_in_the_end():
     assert found.records[-1][0] - finish < endless.iterations
 
 
+@pytest.mark.slow
 def test_attempts_go_on_without_noise_where_it_brought_less():
     flow = replace(SHORT, iterations=200, noise=Constant(1e-6))  # it only takes longer
     found = search(Restarts(flow, descent=5, attempts=4, enough=2.0))

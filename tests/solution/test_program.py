@@ -189,6 +189,7 @@ def test_the_polish_goes_to_the_tolerance_of_the_precision_or_to_the_one_given()
     assert ((loose.residual > 1e-8) & (loose.residual < 1e-3)).all()
 
 
+@pytest.mark.slow
 def test_noise_finds_the_global_minimum_of_several():
     # On the unit circle c = cos(3 angle) + x_2 has three minima
     def cost(x):

@@ -234,6 +234,7 @@ def test_the_same_motion_comes_out(name, change):
     assert min(apart) < CLOSE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_the_answer_to_each_terminal_weight_is_the_cheapest_at_that_weight(name):
     # At 1e6 the swing-up's is 5e8 times the running weight: too much for float32

@@ -54,6 +54,7 @@ def least_cost():
     return 0.5 * np.sum((J @ u + r) ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 def test_shooting_nears_the_optimum(method):
     optimum = least_cost()

@@ -85,6 +85,7 @@ def test_guesses_fit_their_problems(name):
     assert values.costs.shape == (K + 1,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OPEN)
 def test_open_problems_leave_something_open_or_follow_data(name):
     problem, knots = suite.posed(name)
