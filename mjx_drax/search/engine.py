@@ -405,9 +405,9 @@ class Search:
         """Go on to another attempt, or finish; False if nothing more is to be done.
 
         If attempts are `heated`, the second one is, and later ones of a single problem are if
-        that has brought more chains. If that is open (None), those of a single problem are in turns
-        until one has made a chain done, and then what has brought more. In a batch, where answers
-        must not depend on others, all are, or none.
+        that has brought more chains, or if all are asked for. If that is open (None), those of a
+        single problem are in turns until one has made a chain done, and then what has brought more.
+        In a batch, where answers must not depend on others, all are, or none.
         """
         stage, settings, family = self.stage, self.settings, self.family
         kept, everyone = stage.kept, np.arange(family.count)
@@ -426,7 +426,7 @@ class Search:
             better = noise_is_better(found, stage.steps)
             if settings.heated is None:
                 heated = better if found.any() else not stage.heated
-            elif stage.attempt > 0:
+            elif stage.attempt > 0 and not self._thorough:
                 heated &= better
         scale = stricter(stage.cost_scale, kept.feasible.reshape(family.count, self.chains))
         self.stage = replace(
@@ -466,7 +466,14 @@ class Search:
         rollouts = self.settings.rollouts
         assert rollouts is not None
         polished = self.polish is not None
-        return self.family.alone and polished and rollouts.first + rollouts.rounds == 0
+        asked = self.family.alone and polished and not self._thorough
+        return asked and rollouts.first + rollouts.rounds == 0
+
+    @property
+    def _thorough(self) -> bool:
+        """Whether all attempts are asked for, to find better optima than those that come easily."""
+        assert self.settings.enough is not None
+        return self.settings.enough > 1.0
 
     def _unfinished(self, chains: Chains) -> np.ndarray:
         """Which chains are being polished, (rows,); when finishing, if they have iterations left.

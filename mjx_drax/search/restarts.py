@@ -91,8 +91,9 @@ class Restarts:
         within: a chain is done if it is feasible, reaches the goal where it was replayed, and
             exceeds the best chain's cost by at most this share. None: 0.1; 1 where f has kinks.
         enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
-            where f has kinks. Above 1 all attempts are made, by all chains: that takes longer, and
-            finds better optima where all chains of the first attempt lead to the same ones.
+            where f has kinks. Above 1 all attempts are made, by all chains, to their ends and (if
+            `heated`) with noise: that takes longer, and finds better optima where all chains of the
+            first attempt lead to the same ones.
         heated: whether attempts after the first may be heated, or all descend like the first. None:
             they may; where f has kinks it stays None, and a single problem's are heated in turns
             with others until a chain is done.
