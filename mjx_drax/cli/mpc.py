@@ -82,8 +82,7 @@ def run(options: argparse.Namespace) -> int:
     Plant(problem, **errors)  # refuses numbers that make no sense
     look = pictures.look_of(options)
     if options.video:
-        seen = {name: value for name, value in look.items() if name != "caption"}
-        require_drawing(problem, **seen)
+        require_drawing(problem, **pictures.without_caption(look))
     folder = writable(options.out or Path("out") / f"mpc_{problem.name}")
     tell = say_nothing if options.json else say
     tell(f"{problem.name}: K = {problem.horizon} knots, {options.chains} chains; compiling ...")

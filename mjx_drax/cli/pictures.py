@@ -61,6 +61,11 @@ def look_of(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
+def without_caption(look: dict[str, Any]) -> dict[str, Any]:
+    """What `look_of` gives, for functions that write no caption."""
+    return {name: value for name, value in look.items() if name != "caption"}
+
+
 def in_folder(folder: str) -> list[Path]:
     """Those of `NAMES` that lie in a folder, videos first."""
     videos_first = sorted(NAMES, key=lambda name: not name.endswith(".mp4"))

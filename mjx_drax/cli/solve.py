@@ -156,7 +156,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = pictures.look_of(options)
-    seen = {name: value for name, value in look.items() if name != "caption"}
+    seen = pictures.without_caption(look)
     if look or options.film is not None or options.side_by_side:
         require_drawing(problem, draw=None if options.side_by_side else draw, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)

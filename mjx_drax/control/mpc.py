@@ -430,14 +430,14 @@ class MPC:
             before = v[: dynamics.nu], np.bool_(self._applied.any)
             whole[len(whole) - len(v) :] = v
         return Now(
-            whole,
-            number(t),
-            number(by),
-            np.int32(self.iterations),
-            number(np.sqrt(max(cost, 1e-12))),
-            number(t - self._began),
-            moved.data,
-            before,
+            x=whole,
+            t=number(t),
+            by=number(by),
+            iterations=np.int32(self.iterations),
+            noise=number(np.sqrt(max(cost, 1e-12))),
+            passed=number(t - self._began),
+            data=moved.data,
+            before=before,
         )
 
     def _begin(self, t: float) -> None:

@@ -2,9 +2,9 @@
 
 Inside a batched scan an unrolled Cholesky beats the library's batched call many times over at
 sizes up to 8 (3 to 22 times on CPU). Above that, GPUs call the library, or a kernel of ours where
-equations are solved (`positive_matrices`). CPUs run a loop over
-columns: it is about as fast as LAPACK, and two batches of LAPACK calls that run at the same time
-can wait for each other forever in jaxlib's thread pool (0.10, on two cores, nearly always).
+equations are solved (`positive_matrices`). CPUs run a loop over columns: it is about as fast as
+LAPACK, and two batches of LAPACK calls that run at the same time can wait for each other forever in
+jaxlib's thread pool (0.10, on two cores, nearly always).
 """
 
 from __future__ import annotations

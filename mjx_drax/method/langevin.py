@@ -203,9 +203,9 @@ class Langevin:
         else:
             new = bounds.confine(problem.bounds, X, new)
         moved = self._moved(state, new, jnp.asarray(alpha), to)
-        if not tail:  # in which bounds have multipliers of their own, central at first
+        if not tail:
             return moved
-        v = bounds.multipliers(problem.bounds, new, weights.barrier)
+        v = bounds.multipliers(problem.bounds, new, weights.barrier)  # central, for the tail
         return replace(moved, multipliers=replace(moved.multipliers, bounds=v))
 
     def _moved(self, state: State, X: Trajectory, alpha: Array, to: Direction) -> State:

@@ -1,11 +1,11 @@
 """Which GPU kernels an iteration runs, and how long the GPU waits between them.
 
-    python -m mjx_drax.studies.profile TASK[:CHAINS] ... [--iterations N] [--rows N]
+    python -m mjx_drax.studies.profile TASK[:CHAINS] ... [--of KIND] [--iterations N]
 
-For the flow and for the polish of each task, and for plans of model predictive control: the time of
-an iteration or a plan, how many kernels it starts, the time in which one of them runs, and the
-kernels that take longest. Taken from JAX's profiler, in the last of three solves of N iterations
-each, or of three times N plans.
+For the flow and for the polish of each task, or with `--of plan` for plans of model predictive
+control: the time of an iteration or a plan, how many kernels it starts, the time in which one of
+them runs, and the kernels that take longest. Taken from JAX's profiler, in the last of three solves
+of N iterations each, or of three times N plans.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("tasks", nargs="+", metavar="TASK[:CHAINS]")
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--rows", type=int, default=20)
-    parser.add_argument("--of", choices=["flow", "polish", "plan"], help="only one of them")
+    parser.add_argument("--of", choices=["flow", "polish", "plan"], help="default flow and polish")
     options = parser.parse_args(arguments)
     n, rows = options.iterations, options.rows
     usual = Restarts(attempts=1, rollouts=Rollouts(first=0, rounds=0))
@@ -119,14 +119,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for word in options.tasks:
         name, _, chains = word.partition(":")
         problem = tasks.load(name).make()
-        for what, solver in (("flow", flow), ("polish", polish), ("plan", None)):
-            if options.of not in (None, what):
-                continue
-            print(f"\n## {name}, {chains or 64} chains, {what}\n")
-            if solver is not None:
-                measured(partial(solving, problem, int(chains or 64), solver), "iterations", rows)
-                continue
-            policy = MPC(problem, chains=int(chains or 64))
+        count = int(chains or 64)
+        for what, solver in (("flow", flow), ("polish", polish)):
+            if options.of in (None, what):
+                print(f"\n## {name}, {count} chains, {what}\n")
+                measured(partial(solving, problem, count, solver), "iterations", rows)
+        if options.of == "plan":
+            print(f"\n## {name}, {count} chains, plan\n")
+            policy = MPC(problem, chains=count)
             policy.reset(np.asarray(problem.x_init)[: problem.dynamics.given_nx])
             measured(partial(planning, policy, n), "plans", rows)
 
