@@ -156,8 +156,8 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = pictures.look_of(options)
-    seen = pictures.without_caption(look)
     if look or options.film is not None or options.side_by_side:
+        seen = pictures.without_caption(look)
         require_drawing(problem, draw=None if options.side_by_side else draw, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)
     tell = say_nothing if options.quiet or options.json else say
@@ -190,7 +190,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     if options.side_by_side:
         from mjx_drax.view.video import render_comparison
 
-        written.append(render_comparison(solution, folder / "comparison.mp4", **seen).name)
+        written.append(render_comparison(solution, folder / "comparison.mp4", **look).name)
     if film is not None:
         from mjx_drax.view.diffusion import render_diffusion
 

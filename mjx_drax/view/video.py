@@ -100,6 +100,7 @@ def render_comparison(
     camera: str | int | None = None,
     speed: float = 1.0,
     chain: int | None = None,
+    caption: bool = True,
 ) -> Path:
     """Films a chain's plan (left) and its better replay (right) side by side; returns the path.
 
@@ -114,8 +115,8 @@ def render_comparison(
     assert model is not None  # as checked
     chain = solution.chain_or_best(chain)
     width, height = even_size(size)
-    told = outcome_lines(solution, chain, brief=True)
-    overlay = [told[0], "left: plan, right: replay", *told[1:]]
+    overlay = outcome_lines(solution, chain, brief=True) if caption else []
+    overlay[1:1] = ["left: plan, right: replay"] * caption
     below = caption_height([overlay], height, width)
     half = (width - _BETWEEN) // 2
     between = np.full((height - below, _BETWEEN, 3), DARK, np.uint8)

@@ -122,11 +122,17 @@ def test_list_names_every_task(capsys):
         assert name in tasks.names()
 
 
-def test_own_model_is_certified_and_written(own, capsys):
+def test_own_model_is_certified_and_written(own, capsys, monkeypatch):
+    looks = []
+    monkeypatch.setattr(
+        "mjx_drax.view.video.render_comparison", lambda _, to, **look: looks.append(look) or to
+    )
     status = main(
         f"solve --model {own}/slider.xml --cost {own}/mycost.py --chains 4 --iterations 30 "
-        f"--seed 3 --out {own}/out --film {own}/film.gif --fps 5 --size 160x120".split()
+        f"--seed 3 --out {own}/out --film {own}/film.gif --fps 5 --size 160x120 --no-caption "
+        "--side-by-side".split()
     )
+    assert looks == [{"fps": 5.0, "size": (160, 120), "caption": False}]
     assert status == 0
     out = capsys.readouterr().out
     assert "CERTIFIED" in out

@@ -23,7 +23,7 @@ from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 from mjx_drax.view import renderer, video
-from mjx_drax.view.frames import caption_height
+from mjx_drax.view.frames import DARK, caption_height
 from mjx_drax.view.scene import camera_for
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -239,6 +239,23 @@ def test_film_of_a_function_draws_the_replay_so_far(pendulum: Solution, tmp_path
     np.testing.assert_array_equal(seen[-1], pendulum.replayed[0])
     assert _distance(frames[0], frames[20]) > 100
     assert np.abs(frames[20].astype(int) - frames[-1]).mean() < 1
+
+
+def test_plan_and_replay_side_by_side_with_a_caption_or_without(
+    cartpole: Solution, tmp_path: Path
+) -> None:
+    path, good = tmp_path / "both.mp4", _judged(cartpole, True, True, True)
+    films = []
+    for caption in (True, False):
+        video.render_comparison(good, path, fps=20, size=(2 * WIDTH, HEIGHT), caption=caption)
+        films.append(_decoded(path, HEIGHT, 2 * WIDTH))
+    told, plain = films
+    assert len(told) == len(plain) == 5 + 10
+    assert np.abs(told[0, -2:].astype(int) - DARK).max() < 20
+    assert np.abs(plain[0, -2:, :150].astype(int) - DARK).max() > 40  # the floor
+    assert np.abs(plain[0, :, 159:161].astype(int) - DARK).max() < 40  # what is between
+    for side in (plain[0, :, :150], plain[0, :, 170:]):
+        assert _amber(side).any()
 
 
 def test_film_of_a_replay_that_blows_up_stops_there(cartpole: Solution, tmp_path: Path) -> None:
