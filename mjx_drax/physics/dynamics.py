@@ -153,6 +153,9 @@ class MjxDynamics(Dynamics):
         """A model that replaces another one, as by `dataclasses.replace`, has its own structure."""
         object.__setattr__(self, "structure", Structure.of(self.model))
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {model_name(self.mj_model)}>"
+
     def source(self) -> Source:
         """The model's MJCF, with the files that it needs.
 

@@ -94,6 +94,11 @@ class Problem:
     data_at: Callable[[Any], Any] | None = field(default=None, metadata=HostOnly)
     name: str = field(default="problem", metadata=HostOnly)
 
+    def __repr__(self) -> str:
+        f = self.dynamics
+        sizes = f"nx={f.nx}, nu={f.nu}, horizon={self.horizon}"
+        return f"<Problem {self.name}: {type(f).__name__}, {sizes}>"
+
     @property
     def times(self) -> np.ndarray:
         """Times of x_0..x_K, (K + 1,) [s]."""

@@ -24,6 +24,10 @@ def make(**changes):
     return from_function(lambda x, u: x + u, **{**given, **changes})
 
 
+def test_a_problem_shows_itself_in_a_line():
+    assert repr(make(name="drift")) == "<Problem drift: FunctionDynamics, nx=1, nu=1, horizon=10>"
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
