@@ -6,6 +6,7 @@ color, so that one frame shows a whole motion.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -26,9 +27,11 @@ Arrow = tuple[Floats, Floats]
 
 _MARGIN = 1.1  # factor on the free camera's distance
 _ROOM = 2.0  # the same for one that follows, so that one sees where the robot goes
+_AROUND = 1.3  # the free camera's distance grows at most so much to see what stands still
 _FAR = 8.0  # a robot travels far if its way is so many times its size
 _SUN = np.array([0.4, 0.5, -1.0])  # where light comes from in a model without lights: its direction
 _RED = np.array([0.85, 0.15, 0.1, 1.0])
+_GROUPS = 3  # geoms of the groups 0, 1 and 2 are drawn
 _POSES = 240  # so many poses of a motion decide where the free camera stands
 
 
@@ -196,12 +199,11 @@ def _free_camera(
 ) -> mujoco.MjvCamera:
     """A camera that sees every moving geom in every pose of the motion.
 
+    It also sees geoms that stand still, such as obstacles, if it need not go much farther for them.
     One that follows keeps its distance and direction from the centre of mass of the body that
     travels, and sees every geom of that robot.
 
-    It looks in the direction of the camera "main" at qpos0, if there is one. With axes right, up
-    and ahead, a ball of radius b at (x, y, z) from the middle of all is within a half angle a of
-    the frame if the camera stands (|x| cos a + b) / sin a - z or more before the middle.
+    It looks in the direction of the camera "main" at qpos0, if there is one.
     """
     sized = model.geom_rbound > 0.0  # planes have none
     moving = sized & (model.body_weldid[model.geom_bodyid] != 0)
@@ -227,17 +229,44 @@ def _free_camera(
     ahead = np.cos(elevation) * flat + np.array([0.0, 0.0, np.sin(elevation)])
     right = np.array([flat[1], -flat[0], 0.0])
     axes = np.array([right, np.cross(right, ahead), ahead])
-    across, up, depth = axes @ (points - center).T if points.size else np.zeros(3)
+    offsets = axes @ (points - center).T if points.size else np.zeros((3, 1))
     half = np.arctan(np.tan(np.radians(model.vis.global_.fovy) / 2.0) * np.array([aspect, 1.0]))
-    distance, shift = 0.0, np.zeros(2)
-    for i, (offset, angle) in enumerate(zip((across, up), half, strict=True)):
-        low, high = np.min(offset - bound), np.max(offset + bound)
-        shift[i] = (low + high) / 2.0
-        reach = (np.abs(offset - shift[i]) * np.cos(angle) + bound) / np.sin(angle) - depth
-        distance = max(distance, float(reach.max()))
+    distance, shift = _fitted(offsets, bound, half)
+    still = sized & ~chosen & (model.geom_group < _GROUPS) if body is None else []
+    most = _AROUND * distance
+    for corners in _corners(model, np.flatnonzero(still)):
+        more = np.hstack([offsets, axes @ (corners - center).T])
+        radii = np.append(bound, np.zeros(8))
+        farther, aside = _fitted(more, radii, half)
+        if farther < most:
+            offsets, bound, distance, shift = more, radii, farther, aside
     camera.lookat[:] = center + shift @ axes[:2]
     camera.distance = (_MARGIN if body is None else _ROOM) * distance
     return camera
+
+
+def _fitted(offsets: Floats, bound: Floats, half: Floats) -> tuple[float, Floats]:
+    """How far away a camera sees balls at offsets (3, n), and how far right and up it looks (2,).
+
+    With axes right, up and ahead, a ball of radius b at (x, y, z) is within a half angle a of the
+    frame if the camera stands (|x| cos a + b) / sin a - z or more before the middle.
+    """
+    distance, shift = 0.0, np.zeros(2)
+    for i, (offset, angle) in enumerate(zip(offsets[:2], half, strict=True)):
+        low, high = np.min(offset - bound), np.max(offset + bound)
+        shift[i] = (low + high) / 2.0
+        reach = (np.abs(offset - shift[i]) * np.cos(angle) + bound) / np.sin(angle) - offsets[2]
+        distance = max(distance, float(reach.max()))
+    return distance, shift
+
+
+def _corners(model: mujoco.MjModel, chosen: npt.NDArray[np.int64]) -> Floats:
+    """Corners of the boxes about some geoms that stand still, (n, 8, 3)."""
+    data = next(posed(model, model.qpos0[None]))
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    boxes, turns = model.geom_aabb[chosen], data.geom_xmat[chosen].reshape(-1, 3, 3)
+    inside = boxes[:, None, :3] + signs * boxes[:, None, 3:]
+    return data.geom_xpos[chosen][:, None] + inside @ turns.transpose(0, 2, 1)
 
 
 def _direction(model: mujoco.MjModel) -> tuple[float, float]:
