@@ -140,24 +140,23 @@ def reference() -> str:
 
 
 def gallery() -> str:
-    """Every task: its poster, how to solve it, and the function that states it."""
+    """Every task: its film and poster, how to solve it, and the function that states it."""
     lines = [
         "# Gallery",
         "",
-        "All tasks of `mjx-drax list`. A picture shows the replay of an answer; of its poses the",
-        "fainter are earlier. Each task is a file that states a problem. Here are its function",
-        "`make` and what that takes of other tasks; the functions of the cost are in the file. The",
-        "command writes a video, a film, pictures and plots into `out/TASK`.",
+        "All tasks of `mjx-drax list`. Films and pictures show the replay of an answer; two films",
+        "show before how knots became it. Films of short motions are in slow motion, those of long",
+        "ones faster: t is the motion's time. Of the poses in a picture the fainter are earlier.",
+        "Each task is a file that states a problem. Here are its function `make` and what that",
+        "takes of other tasks; the functions of the cost are in the file. The command writes a",
+        "video, a film, pictures and plots into `out/TASK`.",
         "",
     ]
     for name in tasks.names():
-        pictures = [
-            f"{name}.webp",
-            f"posters/{name}.webp",
-        ]  # a film, if there is one, and the poster
+        pictures = f"{name}.webp", f"posters/{name}.webp"  # the film, and the poster
         shown = [picture for picture in pictures if (ROOT / "docs" / picture).exists()]
         lines += [f"## {name}", "", tasks.summary(name), ""]
-        lines += [" ".join(f"![{name}]({picture}){{ width=400 }}" for picture in shown), ""]
+        lines += [" ".join(f"![{name}]({picture}){{ width=49% }}" for picture in shown), ""]
         lines += ["```sh", f"mjx-drax solve {name} --film", "```", ""]
         others = re.findall(rf"\b({'|'.join(tasks.names())})\.(\w+)", stated(name, "make"))
         for task, part in [(name, "make"), *others]:

@@ -77,6 +77,23 @@ def render(
       DraxError: a path, size, fps, speed, camera or chain that cannot be used, or neither a model
         nor `draw`.
     """
+    look: dict[str, Any] = {"size": size, "camera": camera, "speed": speed, "draw": draw}
+    return write(path, frames_of(solution, chain, plan, caption, fps=fps, **look), fps)
+
+
+def frames_of(
+    solution: Solution,
+    chain: int | None = None,
+    plan: bool = False,
+    caption: bool = True,
+    *,
+    fps: float = 30.0,
+    size: tuple[int, int] = (640, 480),
+    camera: str | int | None = None,
+    speed: float = 1.0,
+    draw: Draw | None = None,
+) -> Generator[Frame, None, None]:
+    """The frames (height, width, 3) uint8 of `render`, whose arguments these are."""
     check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
     chain = solution.chain_or_best(chain)
     states = states_of(solution, chain, plan)
@@ -84,11 +101,12 @@ def render(
     overlay = outcome_lines(solution, chain, plan, brief=True) if caption else []
     model = mujoco_model(solution.problem.dynamics)
     if model is not None:
-        qpos, look = states[:, : model.nq], {"size": size, "camera": camera, "speed": speed}
-        return render_motion(model, qpos, times, path, overlay=overlay, fps=fps, **look)
+        qpos = states[:, : model.nq]
+        look: dict[str, Any] = {"size": size, "camera": camera, "speed": speed}
+        return motion_frames(model, qpos, times, overlay=overlay, fps=fps, **look)
     assert draw is not None  # as checked
     moments = frame_times(times, fps, speed)
-    return write(path, _drawn_frames(draw, states, times, moments, overlay, even_size(size)), fps)
+    return _drawn_frames(draw, states, times, moments, overlay, even_size(size))
 
 
 def render_comparison(

@@ -54,6 +54,7 @@ def test_the_site_has_every_public_name_and_task(tmp_path):
     gallery = (tmp_path / "gallery.md").read_text(encoding="utf-8")
     for name in tasks.names():
         assert f"## {name}\n" in gallery
+        assert f"({name}.webp)" in gallery  # the film; see docs/make_films.py
         assert f"(posters/{name}.webp)" in gallery
     menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     for page in tmp_path.rglob("*.md"):

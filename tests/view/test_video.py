@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
 import warnings
@@ -14,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from PIL import Image
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.method.langevin import Langevin
@@ -162,6 +164,25 @@ def test_by_default_the_motion_fills_the_frame(backend: str) -> None:
         share.append(np.ptp(rows) / HEIGHT)
     assert share[0] < 0.4
     assert 0.75 < share[1] < 0.95
+
+
+def test_obstacles_beside_the_motion_are_in_the_frame(backend: str) -> None:
+    def seen(place: float) -> np.ndarray:
+        """Rows and columns of the red box in a film of a ball that goes 1 m to the right."""
+        model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><worldbody><light pos="0 0 9"/>
+            <geom type="box" pos="{place} 0 0" size=".1 .1 .1" rgba="1 0 0 1"/>
+            <body><joint type="slide" axis="1 0 0"/><geom size=".1" rgba="0 0 1 1"/></body>
+            <camera name="main" pos="0 -5 0" xyaxes="1 0 0 0 0 1"/></worldbody></mujoco>"""
+        )
+        frame = video.render_frames(model, [[0.0], [1.0]], [0, 1], fps=1, size=(WIDTH, HEIGHT))[0]
+        red, green, blue = frame.astype(int).transpose(2, 0, 1)
+        assert np.count_nonzero(blue > green + 60) > 80  # the ball, never tiny
+        return np.argwhere(red > green + blue + 60)
+
+    columns = seen(-0.25)[:, 1]  # left of the ball
+    assert 0 < columns.min() < columns.max() < WIDTH / 3
+    assert not seen(-5.0).size
 
 
 @pytest.mark.parametrize(("way", "follows"), [(2.0, False), (4.0, True)])
@@ -337,6 +358,27 @@ def test_the_plan_of_any_chain_can_be_filmed(pendulum: Solution, tmp_path: Path)
     assert told.startswith("PLAN of chain 1, not a replay: breaks the dynamics in angle [rad]")
     with pytest.raises(DraxError, match=f"chain is 99: give a number below {len(x)}"):
         video.render(failed, path, draw=draw, chain=99)
+
+
+def test_a_film_of_the_gallery_is_made_from_a_saved_answer(
+    pendulum: Solution, tmp_path: Path
+) -> None:
+    film = runpy.run_path(str(ROOT / "docs" / "make_films.py"))["film"]
+    _judged(pendulum, True, True, True).save(tmp_path / "good")
+    path = film(tmp_path / "good", tmp_path)
+    assert path == tmp_path / "pendulum.webp"
+    with Image.open(path) as found:
+        assert found.size == (480, 360)
+        assert found.info["loop"] == 0
+        seconds = 0.0
+        for index in range(found.n_frames):
+            found.seek(index)
+            found.load()
+            seconds += found.info["duration"] / 1000
+    assert seconds == pytest.approx(3.55, abs=0.01)  # slow motion, and the end held
+    _judged(pendulum, False, True, True).save(tmp_path / "bad")
+    with pytest.raises(DraxError, match="not certified: solve pendulum"):
+        film(tmp_path / "bad", tmp_path)
 
 
 def test_captions_are_under_the_picture_and_can_be_left_out() -> None:
