@@ -31,7 +31,7 @@ from mjx_drax.physics.differences import PARTS, Change, differences, disabling, 
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, put_model
-from mjx_drax.physics.pairs import Contacts, contact_pairs, left_out
+from mjx_drax.physics.pairs import Contacts, contact_pairs, geom_name, left_out
 from mjx_drax.physics.source import binary
 from mjx_drax.physics.states import Engine, integrate, quiet, set_state, stopped_at_once
 
@@ -49,6 +49,9 @@ MOMENTS = (0.05, 0.2, 0.6)
 OTHER = 1e-3
 """Change of velocities [rad/s, m/s] in one step, by the model's own contact-solver options, above
 which they count as other physics."""
+
+ROUNDED = 1e-6
+"""Distances, in extents of the model, below which float32 may not tell whether geoms touch."""
 
 BEYOND = 0.01
 """Share of a joint's range by which x_init may lie beyond it unsaid: limits give way a little."""
@@ -182,6 +185,35 @@ def _beyond_limits(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> str 
         f"x_init of {name} lies outside of the range of joints ({'; '.join(found)}): move it "
         "inside, or widen the range. (Angles in the file are degrees, unless it says "
         '<compiler angle="radian"/>.)'
+    )
+
+
+def _just_touching(
+    engine: Engine, name: str, x_init: np.ndarray, controls: np.ndarray
+) -> str | None:
+    """Says where geoms touch at x_init (nx,) by so little that rounding decides whether they do.
+
+    The plan, in float32, may then start with other contacts than the replay. That matters where
+    controls (n, nu) move the geoms much within a step.
+    """
+    sides = []
+    for sign in (1.0, -1.0):
+        side = copy.deepcopy(engine)
+        for margin in (side.model.geom_margin, side.model.pair_margin):
+            margin += sign * ROUNDED * engine.model.stat.extent
+        sides.append(side)
+    velocities = slice(engine.model.nq, engine.model.nq + engine.model.nv)
+    steps = np.array([[side.step(x_init, u)[velocities] for u in controls] for side in sides])
+    change = float(np.abs(steps[0] - steps[1]).max())
+    touch, apart = (side.touching(x_init) for side in sides)
+    doubtful = sorted(touch - apart)
+    if not (doubtful and change > WORST):
+        return None
+    a, b = (geom_name(engine.model, g) for g in doubtful[0])
+    return (
+        f"at the x_init of {name} {a!r} and {b!r} touch by so little that rounding decides whether "
+        f"they do, and velocities after a step differ by {change:.1e} for it: move x_init by 1e-4 "
+        "m, so that they overlap, or are apart."
     )
 
 
@@ -379,6 +411,7 @@ def _examined(
     error = float(errors.velocity.max())
     notes: list[str | None] = [
         _beyond_limits(model, name, x_init),
+        _just_touching(engine, name, x_init, at.u),
         *(f"{name}: {sentence}." for sentence in set_aside(model)),
         _other_physics(model, name, at, contacts),
     ]

@@ -5,6 +5,8 @@
   a tilted box has more contacts there.
 - Capsules on planes have the C engine's directions of friction, along and across the capsule. MJX
   has others where a capsule is steeper than 60 degrees.
+- Meshes on planes touch with the face that the C engine has, where MJX takes corners of the whole
+  hull.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
   points on them.
 - Two polytopes touch at every point once, where MJX repeats some, and halfway between their faces;
@@ -21,7 +23,7 @@ import dataclasses
 import itertools
 import threading
 from collections.abc import Collection, Iterable, Iterator
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -62,6 +64,9 @@ constant in derivatives, which grow without bound; below the second they are the
 SAME = 1e-6
 """How close two contacts of one pair are the same one [m]."""
 
+TURNS = 4
+"""How often three corners of a face move on in turn; with sixteen corners they stop after three."""
+
 GROWTH = 4
 """Hulls whose numbers of corners are between the same powers of this are padded to one size."""
 
@@ -72,7 +77,6 @@ CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 """The corners of a cube, (8, 3)."""
 
 _ONE_AT_A_TIME = threading.RLock()
-_MJX_PLANE_MESH = COLLISIONS[PLANE, MESH]
 
 BLIND = np.zeros((9, 9), bool)
 """Kinds of geoms, the lower one first, whose distance MJX knows only where they overlap."""
@@ -237,18 +241,64 @@ plane_capsule.ncon = 2  # type: ignore[attr-defined]
 
 
 def plane_mesh(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
-    """The same of meshes, as MJX makes them, which takes corners below a plane only.
+    """The same of meshes, (4 n, ...): corners of the face that lies on the plane.
 
-    The plane is raised by 1 m, so that corners within a margin above it count as well.
+    As in the C engine (as of 3.17), it is the face nearest to parallel of those at the lowest
+    corner, and four corners of it where it has more.
     """
-    up = data.geom_xmat[..., 2]
-    raised = data.replace(geom_xpos=data.geom_xpos.at[geom[:, 0]].add(up[geom[:, 0]]))
-    dist, pos, frame = _MJX_PLANE_MESH(model, raised, key, geom)
-    acts = dist < 0
-    return jnp.where(acts, dist + 1.0, 1.0), pos - 0.5 * acts[:, None] * frame[:, 0], frame
+    plane, hull = geom.T
+    mesh = jax.tree.map(jnp.asarray, internal(model).mesh_convex[key.data_ids[1]])
+    pose = [at[g] for g in (plane, hull) for at in (data.geom_xpos, data.geom_xmat)]
+    dist, pos, frame = jax.vmap(partial(_on_plane, mesh))(*pose)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
 
 plane_mesh.ncon = 4  # type: ignore[attr-defined]
+
+
+def _on_plane(mesh: ConvexMesh, origin: Array, turn: Array, centre: Array, own: Array) -> Contacts:
+    """Contacts (4, ...) of one hull with one plane: where each is, and how it is turned."""
+    normal = turn[:, 2]
+    down = -normal @ own
+    lowest = mesh.vert[jnp.argmax(mesh.vert @ down)]
+    beside = (mesh.face == lowest).all(axis=2).any(axis=1)
+    corners = mesh.face[jnp.argmax(mesh.face_normal @ down - 2.0 * ~beside)]
+    if len(corners) > 4:
+        count = jnp.any(corners[1:] != corners[:-1], axis=1).sum() + 1
+        corners = corners[jnp.where(count > 4, _spread(corners, lowest, count), jnp.arange(4))]
+    repeated = (corners[:, None] == corners).all(axis=-1) & (np.tri(len(corners), k=-1) > 0)
+    corners = jnp.pad(corners, ((0, 4 - len(corners)), (0, 0)))
+    absent = jnp.pad(repeated.any(axis=1), (0, 4 - len(repeated)), constant_values=True)
+    points = centre + corners @ own.T
+    dist = (points - origin) @ normal
+    pos = points - 0.5 * dist[:, None] * normal
+    frame = jnp.broadcast_to(make_frame(normal), (4, 3, 3))
+    return jnp.where(absent, 1.0, dist), pos, frame
+
+
+def _spread(corners: Array, first: Array, count: Array) -> Array:
+    """Which of the `count` corners of a face (n, 3) touch: `first`, and three that span an area.
+
+    The three move on around the face as long as the area grows, each in turn, as in the C engine.
+    """
+    i = jnp.arange(len(corners))
+    start = jnp.argmin(jnp.sum((corners - first) ** 2, axis=1))
+    corners = jax.lax.stop_gradient(corners)[(start + i) % count]
+    a, b, c, d = (jnp.asarray(k) for k in range(4))
+
+    def onwards(k: Array, area: Array, end: Array) -> Array:
+        """The first index from k on, before `end`, behind which the area (n,) does not grow."""
+        ends = (i + 1 >= end) | (jnp.roll(area, -1) <= area)
+        return jnp.argmax(ends & (i >= k))
+
+    for _ in range(TURNS):
+        of_d = jnp.cross(corners[c] - corners[a], corners - corners[b])
+        d = onwards(d, jnp.linalg.norm(of_d, axis=1), count)
+        of_c = jnp.cross(corners - corners[a], corners[d] - corners[b])
+        c = onwards(c, jnp.linalg.norm(of_c, axis=1), d)
+        of_b = jnp.cross(corners[c] - corners[a], corners[d] - corners)
+        b = onwards(b, jnp.linalg.norm(of_b, axis=1), c)
+    return (start + jnp.stack([a, b, c, d])) % count
 
 
 def polytope(points: np.ndarray) -> ConvexMesh:

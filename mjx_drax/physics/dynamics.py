@@ -30,7 +30,8 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
 from mjx_drax.physics.observed import Observed
-from mjx_drax.physics.pairs import Contacts, contact_pairs
+from mjx_drax.physics.pairs import Contacts, contact_pairs, geom_name
+from mjx_drax.physics.pairs import left_out as pairs_left_out
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.physics.states import difference, integrate, set_state
 from mjx_drax.physics.stepper import Stepper
@@ -342,6 +343,18 @@ class MjxDynamics(Dynamics):
     def observe_replayed(self, x: np.ndarray, time: float) -> mujoco.MjData:
         """`mujoco.MjData` at a state (nx,), after mj_forward: what goals of replays receive."""
         return self.observer()(x, time)
+
+    def left_out(self, states: np.ndarray) -> tuple[int, str] | None:
+        """The first of states (n, nx) with a contact that the plan has not, and its geoms."""
+        without = pairs_left_out(self.mj_model, self.contacts)
+        observe = self.observer()
+        for i, x in enumerate(states if without else []):
+            contact = observe(x, 0.0).contact
+            for pair in contact.geom[contact.efc_address >= 0].tolist():
+                if without & {tuple(pair), tuple(pair[::-1])}:
+                    a, b = (geom_name(self.mj_model, g) for g in pair)
+                    return i, f"{a!r} touches {b!r}"
+        return None
 
     def observer(self) -> Callable[[np.ndarray, float], mujoco.MjData]:
         """`observe_replayed` for many states, in one MjData, which takes long to make."""

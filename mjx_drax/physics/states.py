@@ -157,6 +157,11 @@ class Engine:
         contact = self._contacts(x)
         return int(np.bincount(contact.dim[contact.efc_address >= 0], minlength=1).max())
 
+    def touching(self, x: Floats) -> set[Pair]:
+        """The pairs of geoms whose contacts act at x (nx,)."""
+        contact = self._contacts(x)
+        return {(a, b) for a, b in contact.geom[contact.efc_address >= 0].tolist()}
+
     def hulls_touch(self, x: Floats) -> bool:
         """Whether at x (nx,) a contact of a mesh with a box or a mesh acts."""
         contact = self._contacts(x)

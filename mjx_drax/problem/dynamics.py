@@ -173,6 +173,14 @@ class Dynamics:
         """What goal functions receive for a replayed state (nx,) at a time [s]: here the state."""
         return x
 
+    def left_out(self, states: np.ndarray) -> tuple[int, str] | None:
+        """The first of some states (n, nx) where something acts that replays have and f has not.
+
+        Returns:
+            the number of the state, and in words what acts there; None if nothing does.
+        """
+        return None
+
     def observer(self) -> Callable[[np.ndarray, float], Any]:
         """`observe_replayed` for many states: what it returns may change with its next call."""
         return self.observe_replayed

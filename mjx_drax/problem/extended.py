@@ -234,6 +234,10 @@ class Extended(Dynamics):
         """What goal functions receive: as from the inner system."""
         return self.inner.observe_replayed(self.inner_state(x), time)
 
+    def left_out(self, states: np.ndarray) -> tuple[int, str] | None:
+        """As of the inner system."""
+        return self.inner.left_out(states[:, : self.inner.nx])
+
     def observer(self) -> Callable[[np.ndarray, float], Any]:
         """`observe_replayed` for many states, of the inner system."""
         inner = self.inner.observer()

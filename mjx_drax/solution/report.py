@@ -153,6 +153,14 @@ def _advice(solution: Results) -> str:
             f"no plan is feasible; the best {where.told(solution.problem)}. Try more iterations"
             f"{more}, or a longer horizon."
         )
+    unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])
+    if unplanned is not None:
+        knot, contact = unplanned
+        return (
+            f"at knot {knot}, {solution.times[knot]:.2f} s, {contact}, and the plan is made "
+            "without contacts of these two. Add the pair to contacts=, or keep them apart by an "
+            "inequality."
+        )
     violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
     broken = {v.kind for v in violations if v.broken}
     costs = solution.cost[solution.feasible]

@@ -180,7 +180,10 @@ def legs(
 def _standing(
     model: mujoco.MjModel, posture: Mapping[str, float], feet: str, by: float
 ) -> np.ndarray:
-    """qpos (nq,) with `by` times the angles of joints whose names end so, feet on the ground."""
+    """qpos (nq,) with `by` times the angles of joints whose names end so, feet on the ground.
+
+    They are 0.1 mm in it: where they just touch, rounding would decide whether the ground pushes.
+    """
     data, ground = mujoco.MjData(model), model.geom("ground").id
     for j in range(1, model.njnt):
         angle = next((a for end, a in posture.items() if model.joint(j).name.endswith(end)), 0.0)
@@ -191,6 +194,7 @@ def _standing(
     touches = (model.geom_contype | model.geom_conaffinity) != 0
     down = [g for g in np.flatnonzero(touches) if any(fnmatch(n, feet) for n in names[g])]
     data.qpos[2] -= min(mujoco.mj_geomDistance(model, data, g, ground, 9.0, None) for g in down)
+    data.qpos[2] -= 1e-4
     return data.qpos.copy()
 
 
@@ -258,7 +262,7 @@ H1 = {"_hip_pitch": -0.4, "_knee": 0.8, "_ankle": -0.4}
 _ARMS, _LEGS = "robosuite/models/assets/robots", "mjlab/asset_zoo/robots"
 _GYM = "gymnasium_robotics/envs/assets"
 _go1 = partial(legs, GO1, "*_foot_collision", actuators={"position": 60.0})
-_spot = partial(legs, SPOT, "[FR][LR]")
+_spot = partial(legs, SPOT, "??_lleg")  # of which not the feet alone come down
 _g1 = partial(legs, G1, "*_foot*_collision", actuators={"position": 200.0})
 _h1 = partial(legs, H1, "*_ankle_link")
 

@@ -58,6 +58,46 @@ def test_a_box_stands_on_the_corners_that_the_c_engine_has():
     assert counts >= {2, 3, 4}
 
 
+def _prism(sides):
+    around = np.arange(sides) * 2 * np.pi / sides
+    return [[0.1 * np.cos(a), 0.1 * np.sin(a), z] for a in around for z in (-0.05, 0.05)]
+
+
+def _blob(corners):
+    points = np.random.default_rng(5).normal(size=(corners, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True) * [0.1, 0.08, 0.12]
+
+
+@pytest.mark.parametrize("corners", [0.1 * CORNERS, _prism(6), _prism(12), _blob(30)])
+def test_a_mesh_stands_on_the_face_that_the_c_engine_has(corners):
+    numbers = " ".join(map(str, np.ravel(corners)))
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><asset><mesh name="m" vertex="{numbers}"/></asset><worldbody>'
+        '<geom type="plane" size="0 0 1" euler="5 0 0"/><body><freejoint/>'
+        '<geom type="mesh" mesh="m" margin="0.003"/></body></worldbody></mujoco>'
+    )
+    wanted, rng, counts = mujoco.MjData(model), np.random.default_rng(0), set()
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for tilt in [0.05] * 20 + [2.0] * 20:
+            wanted.qpos[:] = [0, 0, 0, 1, *rng.normal(size=3) * tilt]
+            mujoco.mj_kinematics(model, wanted)
+            up, turn = wanted.geom_xmat[0].reshape(3, 3)[:, 2], wanted.geom_xmat[1].reshape(3, 3)
+            low = ((model.mesh_vert @ turn.T + wanted.geom_xpos[1]) @ up).min()
+            wanted.qpos[:3] -= (low + rng.uniform(-0.002, 0.03)) * up
+            mujoco.mj_forward(model, wanted)
+            found = find(wanted)
+            acting = np.asarray(found.dist) < model.geom_margin.sum()
+            one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.contact.pos))
+            for name in ("dist", "pos", "frame"):
+                here, there = (getattr(c, name) for c in (found, wanted.contact))
+                there = there[other].reshape(here[acting].shape)
+                np.testing.assert_allclose(here[acting][one], there, atol=1e-7)
+            counts.add(wanted.ncon)
+    assert counts >= {1, 2}
+    assert max(counts) > 2
+
+
 def test_mjx_keeps_its_own_way():
     boxes = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
     assert COLLISIONS[boxes] is not plane_box

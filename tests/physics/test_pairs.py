@@ -10,7 +10,7 @@ import pytest
 from mjx_drax import DraxError
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics import near
-from mjx_drax.physics.checks import Samples, compare
+from mjx_drax.physics.checks import Samples, compare, examine
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.mjx_model import contact_points, put_model
 from mjx_drax.physics.pairs import contact_pairs, left_out
@@ -92,6 +92,26 @@ def test_dynamics_know_their_contacts_by_number():
     assert dynamics.contacts == dynamics.in_float64().contacts == [(0, 2), (0, 3)]
     again = put_model(model, json.loads(json.dumps(dynamics.contacts)))
     assert jax.tree.structure(again) == jax.tree.structure(planned)
+
+
+def test_dynamics_say_where_a_contact_is_that_they_leave_out():
+    model = walker()
+    dynamics = MjxDynamics(put_model(model, [("foot_*", "floor")]), 0.01, model, 1)
+    states = np.array([[0.0, 0, 0, 0], [-0.01, -0.01, 0, 0], [0.0, -0.31, 0, 0]])
+    assert dynamics.left_out(states) == (2, "'floor' touches 'shin'")
+    assert dynamics.left_out(states[:2]) is None
+    assert MjxDynamics(put_model(model), 0.01, model, 1).left_out(states) is None
+    none = MjxDynamics(put_model(model, contacts=False), 0.01, model, 1)
+    assert none.left_out(states) == (1, "'floor' touches 'foot_left'")
+
+
+@pytest.mark.parametrize(("height", "said"), [(0.0, True), (-1e-4, False), (1e-4, False)])
+def test_geoms_that_just_touch_at_x_init_are_named(height, said):
+    model = walker('<default><geom mass="0.01"/></default>')
+    model.actuator_gear[0, 0], bounded = 100.0, np.zeros(2, bool)
+    x_init, contacts = np.array([height, -0.01, 0.0, 0.0]), [("foot_left", "floor")]
+    notes = examine(model, "walker", x_init, contacts, bounded, None).notes
+    assert any("'floor' and 'foot_left' touch by so little" in note for note in notes) == said
 
 
 def test_of_too_many_contacts_the_nearest_are_kept(monkeypatch):

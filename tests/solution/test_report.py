@@ -118,6 +118,13 @@ def test_the_advice_where_all_chains_miss_the_goal_at_the_same_cost():
     assert "miss the goal or break constraints" in str(others).splitlines()[-1]
 
 
+def test_the_advice_where_the_plan_lacks_a_contact(monkeypatch):
+    solution = made_up(robot(goal=lambda data: False)).certify()
+    told = (2, "'floor' touches 'shin'")
+    monkeypatch.setattr(type(solution.problem.dynamics), "left_out", lambda self, states: told)
+    assert "at knot 2, 0.04 s, 'floor' touches 'shin', and the plan" in str(solution)
+
+
 def test_one_motion_of_one_chain_or_of_several():
     made = made_up(point(), 2)
     assert "2 certified chains make the same motion, at costs from 0 to 0" in str(made)
