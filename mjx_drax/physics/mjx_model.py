@@ -38,6 +38,12 @@ boxes on the floor have. A step with half as many takes as long."""
 SLIPPERY = 1e-7
 """Friction of contacts that have none; with MuJoCo's least, 1e-5, a velocity was off by 7e-4."""
 
+HELD = 1e5
+"""Damping, in M / timestep, above which a joint stays where it is, as a base does that a file holds
+by a damping of 1e11. In a plan inertia holds it: the force of such damping on a velocity that is a
+rounding error would move everything else.
+"""
+
 LIMIT, PAIRS = "max_contact_points", "max_geom_pairs"
 """Custom numbers of a model that tell MJX how many contact points and pairs of geoms to keep."""
 
@@ -156,6 +162,9 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
         # Otherwise MJX refuses geoms that it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
+    held = model.dof_damping * opt.timestep > HELD * model.dof_M0
+    model.dof_armature[held] += opt.timestep * model.dof_damping[held]  # as the integrator does
+    model.dof_damping[held] = 0.0
     touching = _pairs(model, without)
     if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
         # No contact has friction, and MJX fails if elliptic cones are asked for and there are none

@@ -57,7 +57,7 @@ from mjx_drax.search.iterate import (
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
-from mjx_drax.search.sizes import scale_and_floor, sizes_of
+from mjx_drax.search.sizes import median, scale_and_floor, sizes_of
 from mjx_drax.search.warm import Warm, warmed
 
 REPORT_EVERY = 20
@@ -69,6 +69,10 @@ STRAGGLERS = 0.0005
 
 CHEAPER = 1e-3
 """A rollout is an improvement if it is cheaper by more than this share."""
+
+FAR, COOLER, MOST_COOLINGS = 10.0, 0.25, 4
+"""Where noise brings max|h| of most chains to so many times that of the initial knots (or its own
+square), the attempt starts again with so much of the noise, as do those after it; so many times."""
 
 Progress = Callable[[int, int, Info], None]
 
@@ -139,7 +143,9 @@ class Stage:
             noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
         rollouts: how many rollouts, and rounds of them, are done.
         records: iterations done and diagnostics of the rows, for every report of a single problem.
-        began: for every attempt, after how many iterations it began and its noise ended.
+        began: for every attempt, and every start of it, after how many iterations it began and its
+            noise ended.
+        coolings: how often an attempt has started again with less noise.
     """
 
     attempt: int
@@ -161,6 +167,7 @@ class Stage:
     rollouts: int
     records: tuple[tuple[int, Info], ...]
     began: tuple[tuple[int, int], ...] = ()
+    coolings: int = 0
 
     @property
     def done(self) -> int:
@@ -567,6 +574,7 @@ class Search:
             costs = kept.cost.reshape(shape) - self.stage.floor[:, None]
             rows = costs[indices], kept.feasible.reshape(shape)[indices]
             noise = np.sqrt([temperature(*row) for row in zip(*rows, cost, strict=True)])
+            noise *= COOLER**self.stage.coolings
         elif attempt == 0 or not settings.heated:
             flow = replace(flow, iterations=settings.descent)
         if attempt == 0 and isinstance(self.guess, Warm):
@@ -594,7 +602,7 @@ class Search:
     def _iterate(self) -> bool:
         """What is left of the iterations of an attempt; False if they are interrupted."""
         stage, flow = self.stage, self.flow
-        if self.family.alone and len(stage.began) == stage.attempt:
+        if self.family.alone and len(stage.began) == stage.attempt + stage.coolings:
             noisy = int(flow.iterations) if noise_at(flow, 0) > 0.0 else 0
             if self.recorder is not None:
                 self.recorder.begin(stage.owners)
@@ -619,12 +627,27 @@ class Search:
                 worth = now.worth if asked else stage.before
                 now = Chains.of(state, info, np.where(feasible, since, -1))
                 self._report(replace(stage, now=now, before=worth, step=stop), before + stop)
+                if self._too_hot:
+                    self.stage = replace(self.stage, coolings=self.stage.coolings + 1)
+                    self._begin_chunk()
+                    return self._iterate()
                 if not np.asarray(gathered(state.alive, self.mesh)).any():
                     self._require_some(now)
                     break
         except KeyboardInterrupt:  # the chains as they were at the last report
             return False
         return True
+
+    @property
+    def _too_hot(self) -> bool:
+        """Whether noise has thrown most chains of a single problem far away, and could be less."""
+        stage = self.stage
+        noisy = stage.heated and self.settings.descent is not None
+        if not (noisy and self.family.alone and stage.step <= self.flow.iterations):
+            return False
+        first, now = (np.asarray(info.max_defect) for info in (stage.records[0][1], stage.now.info))
+        far = FAR * max(median(first), FAR)
+        return stage.coolings < MOST_COOLINGS and bool((~(now < far)).mean() > 0.5)
 
     def _require_some(self, now: Chains) -> None:
         """Complain where all chains of a first attempt died, and none of them is an answer."""

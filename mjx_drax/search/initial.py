@@ -40,7 +40,8 @@ def initial_knots(
         if array.shape not in ((K, size), (chains, K, size)):
             raise DraxError(
                 f"guess.{label} has shape {array.shape}: give ({K}, {size}), or "
-                f"({chains}, {K}, {size}) with one for each chain."
+                f"({chains}, {K}, {size}) with one for each chain"
+                f"{', x_1 to x_K without x_init' if label == 'x' else ''}."
             )
         if not np.isfinite(array).all():
             raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")

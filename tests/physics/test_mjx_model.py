@@ -426,3 +426,18 @@ def test_a_timestep_at_which_the_c_engine_diverges_is_refused():
     stiff.jnt_stiffness[0], stiff.opt.timestep = 1e4, 0.02
     with pytest.raises(DraxError, match=r"diverges .* tenth of its timestep of 0\.02 s"):
         examine(stiff, "chain", STATES.x[0], True, np.zeros(2, bool), None)
+
+
+def test_a_base_that_enormous_damping_holds_is_held_by_inertia():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><option timestep="0.002"/><worldbody><body>
+        <joint type="slide" axis="1 0 0" damping="1e11"/><geom size="0.3" mass="100"/>
+        <body pos="0 0 0.5"><joint name="elbow" axis="0 1 0" damping="2"/>
+          <geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.04" mass="2"/></body>
+        </body></worldbody><actuator><motor joint="elbow"/></actuator></mujoco>"""
+    )
+    planned = put_model(model)
+    np.testing.assert_allclose(planned.dof_damping, [0.0, 2.0])
+    np.testing.assert_allclose(planned.dof_armature, [0.002 * 1e11, 0.0])
+    states = np.array([[0.0, 0.5, 0.0, 0.3], [0.0, -1.0, 0.0, -2.0]])
+    assert compare(model, Samples(states, np.array([[1.0], [-1.0]]))).velocity.max() < 1e-6

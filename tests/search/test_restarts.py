@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import bouncing
+from builders import bouncing, point
 
 from mjx_drax import (
     Constant,
     DraxError,
     GaussNewton,
+    Geometric,
     Identity,
     Langevin,
     Polish,
@@ -65,6 +66,17 @@ def swing(weight=1.0):
         u_bounds=(-1.0, 1.0),
         x_scatter=(-3.0, 3.0),
     )
+
+
+@pytest.mark.parametrize(("start", "coolings"), [(6.0, 0), (1e3, 2), (1e4, 3)])
+def test_an_attempt_that_noise_throws_away_starts_again_with_less(start, coolings):
+    solver = Restarts(attempts=2, enough=1.1)  # always with noise
+    solver = replace(solver, flow=replace(solver.flow, noise=Geometric(start, 1.5e-3)))
+    found = solve(point(running_residual=lambda x, u: 0.1 * u), chains=4, solver=solver)
+    began = found.history["began"]
+    np.testing.assert_array_equal(np.diff(began)[1:], np.full(coolings, 20))
+    assert len(began) == 2 + coolings
+    assert found.optimal
 
 
 @pytest.mark.slow
