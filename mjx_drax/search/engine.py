@@ -336,16 +336,20 @@ class Search:
 
     def _no_worse(self, found: Chains) -> Chains:
         """What was found; for a chain whose guess was feasible and better, the guess."""
-        knots, keys = self._drawn(0, self.indices)
-        state = self._begun(0, knots, keys)  # which may have moved them off their bounds
-        state = replace(state, trajectory=replace(knots, slack=state.trajectory.slack))
-        state, info = self._iterated(state, 0, 0)
-        guessed = Chains.of(state, info, np.zeros(self.chains, int))
-        inside = np.asarray(info.max_violation) == 0.0
+        guessed = self._guessed()
+        inside = np.asarray(guessed.info.max_violation) == 0.0
         better = _improved(found, guessed, self.stage.floor[:1]) & inside
         source = np.arange(self.chains) + self.chains * better
         state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
         return Chains.of(state, info, np.where(better, 0, found.feasible_since))
+
+    def _guessed(self) -> Chains:
+        """The guess itself, of every chain."""
+        knots, keys = self._drawn(0, self.indices)
+        state = self._begun(0, knots, keys)  # which may have moved them off their bounds
+        state = replace(state, trajectory=replace(knots, slack=state.trajectory.slack))
+        state, info = self._iterated(state, 0, 0)
+        return self._whole(Chains.of(state, info, np.zeros(self.chains, int)))
 
     def _begin_chunk(self) -> None:
         """New initial knots and random numbers for every row."""
@@ -714,14 +718,22 @@ class Search:
         total = rollouts.first + rollouts.rounds
         if total == 0 or self.settings.after < rollouts.iterations:
             return True
+        now = self._whole(stage.now)
+        better = np.zeros(len(stage.owners), bool)
+        if self.guess is not None and stage.attempt == stage.rollouts == 0:
+            # The attempt may have lost a guess that touches where it should: it goes on from it
+            guessed = self._rolled_out(self._guessed(), 0.0, stage.done)
+            better = _improved(now, guessed, stage.floor[:1])
+            now = best_of(now, guessed, stage.owners)
         if (
             stage.rollouts == 0
-            and stage.now.feasible.all()
-            and not self._replayed(stage.now, 1.0)[1].any()
+            and not better.any()
+            and now.feasible.all()
+            and not self._replayed(now, 1.0)[1].any()
         ):
             return True
         try:
-            self.stage = replace(self.stage, now=self._whole(self.stage.now))
+            self.stage = replace(stage, now=now)
             while self.stage.rollouts < total:
                 self._next_rollout(rollouts.first, rollouts.iterations, total)
         except KeyboardInterrupt:

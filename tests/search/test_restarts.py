@@ -414,3 +414,18 @@ def test_chains_start_near_and_far_where_f_has_kinks(balls):
     assert np.abs(far[..., 1]).max(axis=1).min() > 6.0
     assert 0.03 * 7.0 < width.min() < 0.05 * 8.0
     assert 6.0 < width.max() <= 8.0
+
+
+@pytest.mark.slow
+def test_a_feasible_guess_that_an_attempt_loses_is_improved():
+    problem, rng = bouncing(), np.random.default_rng(0)
+    good = solve(problem, chains=8).replayed[1]
+    u = np.clip(good + 0.4 * rng.normal(size=good.shape), -3, 3).astype(np.float32)
+    x = [np.asarray(problem.x_init)]
+    for control in u:
+        x.append(np.asarray(problem.dynamics.step(x[-1], control)))
+    guess = Trajectory(np.stack(x[1:]), u)
+    noise = replace(Restarts().flow, iterations=20, noise=Geometric(30.0, 30.0))
+    solver = Restarts(noise, descent=None, attempts=1, polish=Polish(iterations=6))
+    found = solve(problem, chains=4, solver=solver, guess=guess)
+    assert (found.cost < 0.5 * float(problem.cost(guess))).all()
