@@ -35,7 +35,7 @@ def polished(problem, knots, polish, stop=None, cost=1.0):
 CASES = {"van_der_pol": 14, "crane": 30, "hanging_chain": 24, "hs071": 18, "hs078": 16}
 
 
-QUICK = ("hs071", "hs078")
+QUICK = ("hs071",)
 
 
 @pytest.mark.usefixtures("float64")

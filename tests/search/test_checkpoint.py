@@ -326,7 +326,11 @@ GUESS = Trajectory(jnp.ones((10, 2)), jnp.zeros((10, 1)))
         ({"guess": GUESS}, "other initial knots"),
         ({"problem": problem(guess=lambda key: GUESS)}, "other initial knots"),
         ({"problem": problem(effort=0.2)}, "other functions"),
-        ({"problem": problem(f=lambda x, u: swing(x, 1.1 * u))}, "other functions"),
+        pytest.param(
+            {"problem": problem(f=lambda x, u: swing(x, 1.1 * u))},
+            "other functions",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_another_question_is_refused(written, changes, words):

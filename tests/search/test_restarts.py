@@ -68,7 +68,14 @@ def swing(weight=1.0):
     )
 
 
-@pytest.mark.parametrize(("start", "coolings"), [(6.0, 0), (1e3, 2), (1e4, 3)])
+@pytest.mark.parametrize(
+    ("start", "coolings"),
+    [
+        pytest.param(6.0, 0, marks=pytest.mark.slow),
+        (1e3, 2),
+        pytest.param(1e4, 3, marks=pytest.mark.slow),
+    ],
+)
 def test_an_attempt_that_noise_throws_away_starts_again_with_less(start, coolings):
     solver = Restarts(attempts=2, enough=1.1)  # always with noise
     solver = replace(solver, flow=replace(solver.flow, noise=Geometric(start, 1.5e-3)))
@@ -372,6 +379,7 @@ def test_settings_that_depend_on_the_problem(balls):
     assert found == replace(solver, within=1.0, enough=0.9, **rest)
 
 
+@pytest.mark.slow
 def test_where_f_has_kinks_noise_is_tried_in_turns_while_no_chain_is_done(balls):
     lost = replace(balls[1], goal=lambda x: False)
     solver = Restarts(TINY, descent=5, attempts=4, rollouts=Rollouts(first=1, rounds=0))

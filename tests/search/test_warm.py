@@ -67,6 +67,7 @@ def test_no_chain_ends_worse_than_its_guess(cold):
     assert found.certified
 
 
+@pytest.mark.slow
 def test_solutions_of_other_sizes_are_refused(cold):
     with pytest.raises(DraxError, match="guess is the solution of a problem with 1 constraints"):
         solve(limited(inequality=None), chains=2, guess=cold)
