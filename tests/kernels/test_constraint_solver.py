@@ -95,6 +95,7 @@ def test_cones_have_the_derivatives_and_the_changes_of_their_potential():
     assert set(np.unique(zones)) == {0.0, elliptic.STICKS, elliptic.SLIDES, elliptic.OPEN}
 
 
+@pytest.mark.slow
 def test_among_cones_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian():
     given = drawn_with_cones()
 

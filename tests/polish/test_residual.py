@@ -144,6 +144,7 @@ def regulator():
     return problem, knots, multipliers, (nothing, nothing)
 
 
+@pytest.mark.slow
 def test_it_is_zero_at_a_known_optimum_and_grows_with_the_distance():
     problem, knots, multipliers, v = regulator()
     assert parts_of(problem, knots, multipliers, v).max() < 1e-14

@@ -105,6 +105,7 @@ def test_beyond_enough_every_chain_is_tried_again():
     assert len(further.began) == 3
 
 
+@pytest.mark.slow
 def test_what_an_attempt_leaves_early_is_polished_in_the_end():
     endless = Polish(tolerance=1e-12, iterations=60)
     found = search(Restarts(SHORT, attempts=2, enough=1.0, polish=endless), chains=64)
@@ -167,6 +168,7 @@ def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
     assert (cheaper & kept.chains.feasible >= first.feasible).all()
 
 
+@pytest.mark.slow
 def test_ctrl_c_between_two_attempts_keeps_the_answers_of_the_first():
     reports, drawn = [], []
 
@@ -217,6 +219,7 @@ def test_what_a_replay_missed_is_better_than_infeasible_only():
     np.testing.assert_array_equal(best.sound, ~best.missed)
 
 
+@pytest.mark.slow
 def test_a_langevin_is_one_attempt_as_it_stands():
     found = search(SHORT, chains=4)
     assert found.records[-1][0] == 60

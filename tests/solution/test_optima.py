@@ -165,6 +165,7 @@ def failed(solution, chains):
     )
 
 
+@pytest.mark.slow
 def test_mirror_images_are_two_optima_of_one_cost(hill):
     assert len(hill.optima) == 2
     first, second = hill.optima

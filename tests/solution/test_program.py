@@ -64,6 +64,7 @@ def linear():
 
 
 @pytest.mark.parametrize("solver", [Langevin(), PLATT_BARR], ids=["gauss-newton", "platt-barr"])
+@pytest.mark.slow
 def test_every_chain_reaches_the_kkt_point(linear, solver):
     assert np.abs(LAMBDA).min() > 0.2
     found = minimize(linear, chains=3, solver=solver)
