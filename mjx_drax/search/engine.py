@@ -263,7 +263,7 @@ class Search:
         found = self._merged() if self.stage.begun else self.stage.kept
         assert found is not None
         if self.guess is not None:
-            found = self._no_worse(found)
+            found, _ = self._no_worse(found, self._guessed())
         stage, solve_time = self.stage, time.perf_counter() - self.clock
         records, began = list(stage.records), list(stage.began)
         return Found(found, records, began, first, compile_time, solve_time)
@@ -334,14 +334,13 @@ class Search:
             state = warmed(own, shared, state, self.guess)
         return state
 
-    def _no_worse(self, found: Chains) -> Chains:
-        """What was found; for a chain whose guess was feasible and better, the guess."""
-        guessed = self._guessed()
+    def _no_worse(self, found: Chains, guessed: Chains) -> tuple[Chains, np.ndarray]:
+        """What was found; for a chain whose guess was feasible and better, the guess; and which."""
         inside = np.asarray(guessed.info.max_violation) == 0.0
         better = _improved(found, guessed, self.stage.floor[:1]) & inside
         source = np.arange(self.chains) + self.chains * better
         state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
-        return Chains.of(state, info, np.where(better, 0, found.feasible_since))
+        return Chains.of(state, info, np.where(better, 0, found.feasible_since)), better
 
     def _guessed(self) -> Chains:
         """The guess itself, of every chain."""
@@ -723,8 +722,7 @@ class Search:
         if self.guess is not None and stage.attempt == stage.rollouts == 0:
             # The attempt may have lost a guess that touches where it should: it goes on from it
             guessed = self._rolled_out(self._guessed(), 0.0, stage.done)
-            better = _improved(now, guessed, stage.floor[:1])
-            now = best_of(now, guessed, stage.owners)
+            now, better = self._no_worse(now, guessed)
         if (
             stage.rollouts == 0
             and not better.any()
