@@ -201,6 +201,10 @@ def projected(solution: Solution) -> Solution:
         defect[i] = (defects(problem, states, u[i]) / np.asarray(problem.unit)).max()
     trajectories = replace(rows, x=x, u=u)
     plan = np.asarray(problem.with_start(trajectories), float)
+    violations = plan_violations(Family.of_one(problem), plan, u)
+    for i in which.tolist():  # constraints count as they do for plans
+        broken = (v.size for v in violations.of(i) if "equality" in v.kind)
+        defect[i] = max(defect[i], *broken, 0.0)
     return replace(
         solution,
         trajectories=trajectories,
@@ -208,5 +212,5 @@ def projected(solution: Solution) -> Solution:
         max_defect=defect,
         residual=residual,
         feasible_since=since,
-        plan=plan_violations(Family.of_one(problem), plan, u),
+        plan=violations,
     ).certify()
