@@ -202,12 +202,14 @@ def _just_touching(
         for margin in (side.model.geom_margin, side.model.pair_margin):
             margin += sign * ROUNDED * engine.model.stat.extent
         sides.append(side)
+    touch, apart = (side.touching(x_init) for side in sides)
+    doubtful = sorted(touch - apart)
+    if not doubtful:
+        return None
     velocities = slice(engine.model.nq, engine.model.nq + engine.model.nv)
     steps = np.array([[side.step(x_init, u)[velocities] for u in controls] for side in sides])
     change = float(np.abs(steps[0] - steps[1]).max())
-    touch, apart = (side.touching(x_init) for side in sides)
-    doubtful = sorted(touch - apart)
-    if not (doubtful and change > WORST):
+    if not change > WORST:
         return None
     a, b = (geom_name(engine.model, g) for g in doubtful[0])
     return (
