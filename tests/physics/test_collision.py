@@ -39,6 +39,16 @@ def contacts_of(model):
     return lambda at: find(jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3))
 
 
+def assert_touch_alike(model, found, wanted, atol):
+    """The contacts of MJX that act are those of the C engine, in any order."""
+    acting = np.asarray(found.dist) < model.geom_margin.sum()
+    one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.pos))
+    for name in ("dist", "pos", "frame"):
+        here, there = (getattr(c, name) for c in (found, wanted))
+        there = there[other].reshape(here[acting].shape)
+        np.testing.assert_allclose(here[acting][one], there, atol=atol)
+
+
 def test_a_box_stands_on_the_corners_that_the_c_engine_has():
     model = mujoco.MjModel.from_xml_string(BOX)
     wanted, rng, counts = mujoco.MjData(model), np.random.default_rng(0), set()
@@ -47,13 +57,7 @@ def test_a_box_stands_on_the_corners_that_the_c_engine_has():
         for _ in range(40):
             wanted.qpos[:] = [0, 0, 0.29, 1, *rng.normal(size=3) * 0.04]
             mujoco.mj_forward(model, wanted)
-            found = find(wanted)
-            acting = np.asarray(found.dist) < model.geom_margin.sum()
-            one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.contact.pos))
-            for name in ("dist", "pos", "frame"):
-                here, there = (getattr(c, name) for c in (found, wanted.contact))
-                there = there[other].reshape(here[acting].shape)
-                np.testing.assert_allclose(here[acting][one], there, atol=1e-12)
+            assert_touch_alike(model, find(wanted), wanted.contact, 1e-12)
             counts.add(wanted.ncon)
     assert counts >= {2, 3, 4}
 
@@ -86,13 +90,7 @@ def test_a_mesh_stands_on_the_face_that_the_c_engine_has(corners):
             low = ((model.mesh_vert @ turn.T + wanted.geom_xpos[1]) @ up).min()
             wanted.qpos[:3] -= (low + rng.uniform(-0.002, 0.03)) * up
             mujoco.mj_forward(model, wanted)
-            found = find(wanted)
-            acting = np.asarray(found.dist) < model.geom_margin.sum()
-            one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.contact.pos))
-            for name in ("dist", "pos", "frame"):
-                here, there = (getattr(c, name) for c in (found, wanted.contact))
-                there = there[other].reshape(here[acting].shape)
-                np.testing.assert_allclose(here[acting][one], there, atol=1e-7)
+            assert_touch_alike(model, find(wanted), wanted.contact, 1e-7)
             counts.add(wanted.ncon)
     assert counts >= {1, 2}
     assert max(counts) > 2
