@@ -259,9 +259,12 @@ class Problem:
         inequalities count where positive.
         """
         defect = jnp.abs(values.defects / self.unit).max(initial=0.0)
-        stage = self.constraint.violation(values.constraints.stage)
-        end = self.terminal_constraint.violation(values.constraints.terminal)
-        return jnp.maximum(defect, jnp.maximum(stage, end))
+        return jnp.maximum(defect, self.worst_constraint(values.constraints))
+
+    def worst_constraint(self, values: Stagewise) -> Array:
+        """The largest violation of constraints that have these values, scalar."""
+        stage = self.constraint.violation(values.stage)
+        return jnp.maximum(stage, self.terminal_constraint.violation(values.terminal))
 
     @property
     def widths(self) -> tuple[Array, Array]:
@@ -367,6 +370,25 @@ class Problem:
         with self.arithmetic():
             knots = self.knots.at(slice(-1)) if knots is None else knots
             return self.dynamics.replay(plan, u, gains, limits, knots)
+
+    def engine_defects(self, plan: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """|f(x_k, u_k) - x_{k+1}| of one plan, (K, ndx), by what replays: a step from each x_k.
+
+        Args:
+            plan: x_0..x_K, (K + 1, nx).
+            u: controls, (K, nu).
+
+        Raises:
+            DraxError: the problem was loaded without f.
+        """
+        dynamics, steps = self.dynamics, np.stack([plan[:-1], plan[1:]], axis=1).astype(float)
+        free, gains = np.array(np.inf), np.zeros((len(u), 1, dynamics.nu, dynamics.ndx))
+        with self.arithmetic():
+            knots = jax.tree.map(lambda a: a[:, None], self.knots.at(slice(-1)))
+            given = np.asarray(u, float)[:, None]
+            ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
+        off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
+        return np.nan_to_num(off, nan=np.inf)
 
     def reached(self, x: np.ndarray, time: float | None = None) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.

@@ -53,6 +53,7 @@ from mjx_drax.search.iterate import (
     noise_at,
     ranking,
     restart_at,
+    worst_constraints,
 )
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.restarts import Restarts, scale_of
@@ -777,11 +778,31 @@ class Search:
         rolled = Trajectory(x, u, start=knots.start)
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
-        own = missed if self.family.problem.goal is not None else np.zeros(len(x), bool)
+        own = np.zeros(len(x), bool)
+        if self.family.problem.goal is not None:
+            own, info = missed, self._by_the_engine(info, rolled, ~missed)
         found = self._whole(Chains(state, info, np.full(len(x), done), own))
         if with_feedback:  # a plan is fine that is reached in one of two ways
             missed = missed & chains.missed
         return best_of(replace(chains, missed=missed), found, np.arange(len(x)))
+
+    def _by_the_engine(self, info: Info, knots: Trajectory, won: np.ndarray) -> Info:
+        """Diagnostics of rollouts; max|h| of those that won (rows,) as the replaying engine has it.
+
+        Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
+        that reaches the goal is a motion of the engine: it counts, if it keeps the constraints.
+        """
+        family, defect = self.family, np.array(info.max_defect)
+        which = np.flatnonzero(won & ~(defect < FEASIBLE))
+        if not (family.problem.dynamics.kinked and len(which)):
+            return info
+        broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
+        plan = np.concatenate([family.starts(self.indices, knots)[:, None], knots.x], axis=1)
+        for row in which.tolist():
+            problem = family.at(int(self.indices[row // self.chains]))
+            off = problem.engine_defects(plan[row], np.asarray(knots.u[row]))
+            defect[row] = max((off / np.asarray(problem.unit)).max(), broken[row])
+        return replace(info, max_defect=jnp.asarray(defect))
 
     # Reports, recordings, checkpoints
 

@@ -113,6 +113,17 @@ def restart_at(own: Question, shared: Question, states: State, knots: Trajectory
     return restarted
 
 
+@jax.jit
+def worst_constraints(own: Question, shared: Question, knots: Trajectory) -> Array:
+    """The largest violation of each row's constraints, whatever its dynamics, (rows,)."""
+
+    def of_row(q: Question, knots: Trajectory) -> Array:
+        return q.problem.worst_constraint(q.problem.constraints(knots))
+
+    worst: Array = by_row(shared, own, of_row, knots)
+    return worst
+
+
 def loop(
     rows: tuple[State, Question],
     shared: Question,

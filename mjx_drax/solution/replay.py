@@ -193,28 +193,8 @@ def plan_violations(family: Family, plan: np.ndarray, u: np.ndarray) -> Violatio
 
 
 def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violation:
-    """Where one plan breaks the dynamics most; see `defects`."""
-    off, allowed = defects(problem, plan, u), FEASIBLE * np.asarray(problem.unit)
+    """Where one plan breaks the dynamics most; see `Problem.engine_defects`."""
+    off, allowed = problem.engine_defects(plan, u), FEASIBLE * np.asarray(problem.unit)
     knot, entry = np.unravel_index(int((off / allowed).argmax()), off.shape)
     tolerated = float(allowed[entry])
     return Violation(DYNAMICS, float(off[knot, entry]), tolerated, int(entry), int(knot))
-
-
-def defects(problem: Problem, plan: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """|f(x_k, u_k) - x_{k+1}| of one plan, (K, ndx): each knot's step, from its own state.
-
-    Args:
-        plan: x_0..x_K, (K + 1, nx).
-        u: controls, (K, nu).
-
-    Raises:
-        DraxError: the problem was loaded without f.
-    """
-    dynamics, steps = problem.dynamics, np.stack([plan[:-1], plan[1:]], axis=1)
-    free, gains = np.array(np.inf), np.zeros((len(u), 1, dynamics.nu, dynamics.ndx))
-    with problem.arithmetic():
-        knots = jax.tree.map(lambda a: a[:, None], problem.knots.at(slice(-1)))
-        given = np.asarray(u, float)[:, None]
-        ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
-    off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
-    return np.nan_to_num(off, nan=np.inf)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +24,7 @@ from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.progress import reporting
-from mjx_drax.solution.replay import both_ways, defects, plan_violations
+from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import Tolerances, as_tolerances
@@ -115,7 +114,7 @@ def solve(
         with report as search.progress, said_plainly(f"the solve of {problem.name}"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
-        solution = projected(_certified(problem, settings, seed, found, interrupted, tolerances))
+        solution = _certified(problem, settings, seed, found, interrupted, tolerances)
     return solution if record is None else replace(solution, recording=record.recording())
 
 
@@ -174,43 +173,3 @@ def _certified(
         solve_time=found.solve_time,
         engine=problem.dynamics.engine,
     )
-
-
-def projected(solution: Solution) -> Solution:
-    """The solution with replays that reach the goal in place of plans that are infeasible.
-
-    Where f has kinks, it may differ from what replays a plan by more than a feasible plan may. The
-    replay is a motion of its own: its defects are those of the engine, from knots as they are kept.
-    """
-    problem, rows = solution.problem, solution.trajectories
-    won = solution.open_loop.success | solution.feedback.success
-    which = np.flatnonzero(won & ~solution.feasible & (solution.died_at < 0))
-    if problem.goal is None or not problem.dynamics.kinked or not len(which):
-        return solution
-    x: Any = np.array(rows.x)
-    u: Any = np.array(rows.u)
-    cost, defect, residual, since = (
-        np.array(getattr(solution, name))
-        for name in ("cost", "max_defect", "residual", "feasible_since")
-    )
-    for i in which.tolist():
-        ran = solution.replays_in(solution.mode_of(i))
-        x[i], u[i], cost[i] = ran.states[i, 1:], ran.controls[i], ran.cost[i]
-        residual[i], since[i] = np.nan, solution.iterations
-        states = np.concatenate([solution.plans[i, :1], x[i]]).astype(float)
-        defect[i] = (defects(problem, states, u[i]) / np.asarray(problem.unit)).max()
-    trajectories = replace(rows, x=x, u=u)
-    plan = np.asarray(problem.with_start(trajectories), float)
-    violations = plan_violations(Family.of_one(problem), plan, u)
-    for i in which.tolist():  # constraints count as they do for plans
-        broken = (v.size for v in violations.of(i) if "equality" in v.kind)
-        defect[i] = max(defect[i], *broken, 0.0)
-    return replace(
-        solution,
-        trajectories=trajectories,
-        cost=cost,
-        max_defect=defect,
-        residual=residual,
-        feasible_since=since,
-        plan=violations,
-    ).certify()

@@ -6,7 +6,6 @@ import numpy as np
 
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.solution.replay import defects
 from mjx_drax.solution.results import Results
 from mjx_drax.solution.violations import (
     DYNAMICS,
@@ -30,7 +29,7 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
     `unit` of a state, and 1e-3 of a constraint.
     """
     problem, plan, u, extent = _motion(solution, chain)
-    off = defects(problem, plan, u)
+    off = problem.engine_defects(plan, u)
     allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.unit), off.shape)
     found = list(worst_knots(DYNAMICS, off, allowed, 0))
     none = np.zeros(problem.dynamics.ndx)

@@ -1,6 +1,6 @@
 """Descending first, heating what failed: nothing found is lost, and no setting depends on units."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import bouncing, point
+from jax.tree_util import Partial
 
 from mjx_drax import (
     Constant,
@@ -20,18 +21,21 @@ from mjx_drax import (
     Restarts,
     Smoothed,
     Trajectory,
+    from_dynamics,
     from_function,
     from_program,
     minimize,
     solve,
     solve_batch,
 )
+from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
+from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.search.engine import Chains, Search, best_of
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
-from mjx_drax.search.iterate import Question, begin, iterate, partition, restart_at
+from mjx_drax.search.iterate import Question, begin, evaluate, iterate, partition, restart_at
 from mjx_drax.search.restarts import Rollouts, settled
 
 DT, K = 0.1, 20
@@ -303,6 +307,39 @@ def test_rollouts_follow_where_f_has_kinks(balls):
         path = kinked.recording.path(chain)
         np.testing.assert_array_equal(path.x[-1], kinked.trajectories.x[chain])
         assert path.iteration[-1] == kinked.iterations
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Heavier(FunctionDynamics):
+    """A mass on a wavy track, and 2 % more of it for what replays it."""
+
+    kinked = True
+
+    def replay(self, plan, u, gains, limits, knots):
+        states, forces = super().replay(plan, u / 1.02, gains / 1.02, limits, knots)
+        return states, 1.02 * forces
+
+
+@pytest.mark.parametrize(("fastest", "keeps"), [(5.0, True), (0.5, False)])
+def test_a_rollout_that_reaches_the_goal_is_feasible_by_what_replays_it(fastest, keeps):
+    problem = from_dynamics(
+        Heavier(Partial(lambda x, u: x + DT * jnp.array([x[1], u[0] - jnp.sin(x[0])])), DT, 2, 1),
+        x_init=[0.0, 0.0],
+        horizon=K * DT,
+        running_residual=lambda x, u: 0.1 * u,
+        terminal_residual=lambda x: 10.0 * (x - jnp.array([1.0, 0.0])),
+        inequality=lambda x, u: x[1:] - fastest,
+        x_scatter=(-1.0, 1.0),
+        goal=lambda x: abs(x[0] - 1.0) < 0.3,
+    )
+    rollouts = Rollouts(rounds=0, iterations=1)
+    flow, no_polish = replace(SHORT, tail=1), Polish(iterations=0)
+    once = Restarts(flow, descent=1, attempts=1, rollouts=rollouts, polish=no_polish)
+    found = solve(problem, 4, solver=once)
+    assert (evaluate(problem, found.trajectories).max_defect > 1e-3).all()
+    assert found.certified_chains.all() == keeps
+    assert (found.max_defect < 1e-5).all() == keeps
 
 
 def two_balls(ball, rollouts=None, **changes):

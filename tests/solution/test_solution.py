@@ -24,7 +24,7 @@ from mjx_drax.search.engine import REPORT_EVERY
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import evaluate, iterate
 from mjx_drax.solution.replay import replays
-from mjx_drax.solution.solve import projected, solve
+from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 
 OPTIMUM = 0.031774  # of the pendulum: 600 of 600 IPOPT multistarts agree
@@ -526,21 +526,6 @@ def test_what_jax_raises_is_one_sentence(monkeypatch):
     monkeypatch.setattr("mjx_drax.search.engine.Search.run", fails)
     with pytest.raises(DraxError, match=r"solve of .*out of memory\): try with fewer chains\.$"):
         solve(reach(), 2, progress=False)
-
-
-def test_a_replay_that_reaches_the_goal_takes_the_place_of_a_plan_that_is_infeasible():
-    model = arm('<geom name="floor" type="plane" size="1 1 1" pos="0 0 -0.5"/>')
-    made = made_up(robot(model, goal=lambda data: True)).certify()
-    lost = replace(made, max_defect=np.array([1.0, 0.0], np.float32))
-    found = projected(lost)
-    states = found.open_loop.states
-    assert found.certified_chains.all()
-    assert found.max_defect[0] < 1e-5
-    assert np.isnan(found.residual[0])  # which was another motion's
-    np.testing.assert_allclose(found.trajectories.x[0], states[0, 1:], atol=1e-6)
-    np.testing.assert_array_equal(found.trajectories.x[1], lost.trajectories.x[1])
-    no_goal = replace(made_up(robot(model)).certify(), max_defect=np.ones(2, np.float32))
-    assert projected(no_goal) is no_goal
 
 
 def test_of_chains_that_cost_the_same_the_best_is_an_optimal_one():
