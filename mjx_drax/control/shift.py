@@ -61,7 +61,9 @@ def shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
     if isinstance(polish, Progress):
         polish = replace(polish, stalled=polish.stalled | ~state.alive)
         if isinstance(polish.secant, Secant):
-            polish = replace(polish, secant=replace(polish.secant, B=rows(polish.secant.B)))
+            near = jnp.zeros_like(polish.secant.near)
+            secant = replace(polish.secant, B=rows(polish.secant.B), near=near)
+            polish = replace(polish, secant=secant)
     return replace(
         state,
         trajectory=dynamics.consistent(replace(later.knots, x=x, start=start)),

@@ -25,6 +25,7 @@ Biegler, On the implementation of an interior-point filter line-search algorithm
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -42,7 +43,7 @@ from mjx_drax.method.gauss_newton import slack_step, stage_steps, start_of, with
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Model, Multipliers, QuadraticCost
 from mjx_drax.method.riccati import newton_with_start
-from mjx_drax.polish.curvature import with_exact_hessian
+from mjx_drax.polish.curvature import measured_hessian, with_exact_hessian
 from mjx_drax.polish.residual import (
     STILL,
     Residual,
@@ -53,7 +54,7 @@ from mjx_drax.polish.residual import (
     row_scales,
     slacks_of,
 )
-from mjx_drax.polish.secant import Secant, with_curvature
+from mjx_drax.polish.secant import Secant, blocks, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
@@ -85,6 +86,10 @@ TRIES = 3
 
 NEAR = 0.02
 """Residual below which the curvature that stages have learned is used."""
+
+PATIENCE, MEASURED = 3.0, 1.5
+"""Where f is smooth: after so many iterations for each number of a stage near an optimum, where
+as many rank-one updates could have learned all, curvature is measured once in MEASURED."""
 
 BLOCKED, RAISE = 0.1, 3.0
 """Steps to the boundary shorter than BLOCKED raise the barrier's weight by a factor RAISE."""
@@ -235,6 +240,8 @@ def step(
         learned = learned.updated(
             problem, state.trajectory, derivatives, state.multipliers, learns=before.size > 0.0
         )
+        if not problem.dynamics.kinked:
+            learned = _measured(problem, state, learned, derivatives.cost, residual, scales)
     total = jnp.maximum(residual.total, before.promise)
     optimal = before.optimal | (total < polish.tolerance)
     now = replace(before, secant=learned, residual=total, cost=scales.cost, optimal=optimal)
@@ -247,6 +254,32 @@ def step(
         state, polish=jax.tree.map(lambda a, b: jnp.where(before.active, a, b), now, before)
     )
     return jax.tree.map(lambda a, b: jnp.where(stays & ~first, a, b), kept, new)
+
+
+def _measured(
+    problem: Problem,
+    state: State,
+    learned: Secant,
+    cost: QuadraticCost,
+    residual: Residual,
+    scales: Scales,
+) -> Secant:
+    """What stages have learned; measured now and then where a chain is near an optimum for long."""
+    polish, n = state.polish, len(scales.x) + len(scales.u)
+    near = jnp.where(residual.total < NEAR, learned.near + 1, 0)
+    now = polish.iterations % math.ceil(MEASURED * n) == 0
+    due = polish.active & (near > PATIENCE * n) & now
+
+    def measure(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        at = state.trajectory, state.multipliers
+        once = jnp.where(carry[1], 0.0, 1.0)  # else XLA would take all of it out of the loop
+        H = measured_hessian(problem, *at, once * scales.x, once * scales.u)
+        return H - blocks(cost), jnp.ones((), bool)
+
+    # a loop of one round, which a batch skips where no row needs it
+    kept = learned.B, jnp.zeros((), bool)
+    B, _ = jax.lax.while_loop(lambda carry: due & ~carry[1], measure, kept)
+    return replace(learned, B=B, near=near)
 
 
 def _entered(

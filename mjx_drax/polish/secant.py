@@ -8,7 +8,8 @@ After a step s = (dx_k, du_k), with the stage's Lagrangian l + lambda'f + nu'g a
 
 (the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984). It needs no derivatives
 beyond those that Gauss-Newton has anyway, so programs compile no longer for it. Far from an optimum
-what stages have learned is wrong one step later, so it is used near one only.
+what stages have learned is wrong one step later, so it is used near one only. Where a chain stays
+near one for long and f is smooth, B_k is measured now and then (`curvature`), and learns on.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ class Secant:
         J: Jacobians of dynamics and constraints in (dx, du), (K, ndx + m, n).
         g: gradient of the running cost, (K, n).
         x, u: x_0..x_{K-1} and controls, (K, nx) and (K, nu).
+        near: for how many iterations the chain has been near an optimum.
     """
 
     B: Array
@@ -48,6 +50,7 @@ class Secant:
     g: Array
     x: Array
     u: Array
+    near: Array
 
     @classmethod
     def none(cls, problem: Problem) -> Secant:
@@ -55,7 +58,8 @@ class Secant:
         K, dynamics = problem.horizon, problem.dynamics
         n, rows = dynamics.ndx + dynamics.nu, dynamics.ndx + problem.constraint.rows
         shapes = (K, n, n), (K, rows, n), (K, n), (K, dynamics.nx), (K, dynamics.nu)
-        return cls(*map(jnp.zeros, shapes))
+        B, J, g, x, u = map(jnp.zeros, shapes)
+        return cls(B, J, g, x, u, near=jnp.zeros((), int))
 
     def updated(
         self,
@@ -77,9 +81,9 @@ class Secant:
         y = g - self.g + jnp.einsum("kij,ki->kj", J - self.J, forces)
         terms = jnp.abs(g) + jnp.einsum("kij,ki->kj", jnp.abs(J), jnp.abs(forces))
         noise = NOISE * jnp.finfo(g.dtype).eps * terms
-        learned = jax.vmap(_rank_one)(self.B, _blocks(cost) + self.B, s, y, noise)
+        learned = jax.vmap(_rank_one)(self.B, blocks(cost) + self.B, s, y, noise)
         B = jnp.where(learns, learned, self.B)
-        return Secant(B, J, g, x, knots.u)
+        return Secant(B, J, g, x, knots.u, self.near)
 
 
 def with_curvature(cost: QuadraticCost, B: Array) -> QuadraticCost:
@@ -102,7 +106,7 @@ def _rank_one(B: Array, H: Array, s: Array, y: Array, noise: Array) -> Array:
     return B + jnp.where(takes, 1.0, 0.0) * jnp.outer(r, r) / jnp.where(takes, slope, 1.0)
 
 
-def _blocks(cost: QuadraticCost) -> Array:
+def blocks(cost: QuadraticCost) -> Array:
     """The Hessians of the running cost in (dx, du), (K, n, n)."""
     upper = jnp.concatenate([cost.Hxx[:-1], jnp.swapaxes(cost.Hux, 1, 2)], axis=2)
     return jnp.concatenate([upper, jnp.concatenate([cost.Hux, cost.Huu], axis=2)], axis=1)

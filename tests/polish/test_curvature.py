@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from mjx_drax import LogBarrier, Trajectory, from_function
 from mjx_drax.method.model import Multipliers, expand
 from mjx_drax.method.schedules import Weights
-from mjx_drax.polish.curvature import with_exact_hessian
+from mjx_drax.polish.curvature import measured_hessian, with_exact_hessian
 from mjx_drax.polish.secant import Secant, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.trajectory import Stagewise
@@ -126,6 +126,23 @@ def test_stages_learn_the_curvature_of_a_quadratic_lagrangian_in_as_many_steps_a
     assert np.abs(one.B[1:] - missing[1:]).max() > 0.1
     added = with_curvature(cost, one.B)
     np.testing.assert_allclose(stage_blocks(added) - stage_blocks(cost), one.B, atol=1e-12)
+
+
+def test_differences_measure_the_hessian_and_stay_away_from_where_controls_are_cut_off():
+    def f(x, u):
+        return jnp.array([x[0] * jnp.exp(u[0]), jnp.sin(x[0] * x[1]) + u[0] ** 3])
+
+    box = (-0.5, 0.5)
+    whole = posed(f, u_bounds=box)
+    cut_off = posed(lambda x, u: f(x, jnp.clip(u, *box)), u_bounds=box)
+    knots, multipliers = somewhere(whole, 1)
+    knots = replace(knots, u=jnp.array([[0.5], [-0.5], [0.1]]))
+    cost = derivatives(whole, knots, multipliers).cost
+    exact = with_exact_hessian(whole, knots, multipliers, cost, Autodiff())
+    for problem in (whole, cut_off):
+        H = measured_hessian(problem, knots, multipliers, jnp.ones(NX), 2.0 * jnp.ones(NU))
+        np.testing.assert_allclose(H, stage_blocks(exact), atol=0.01)
+        np.testing.assert_allclose(H[2], stage_blocks(exact)[2], atol=1e-5)  # inside
 
 
 @pytest.mark.slow
