@@ -61,8 +61,8 @@ def shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
     if isinstance(polish, Progress):
         polish = replace(polish, stalled=polish.stalled | ~state.alive)
         if isinstance(polish.secant, Secant):
-            near = jnp.zeros_like(polish.secant.near)
-            secant = replace(polish.secant, B=rows(polish.secant.B), near=near)
+            secant = polish.secant  # which a plan has no time to measure
+            secant = replace(secant, B=rows(secant.B), close=jnp.zeros_like(secant.close))
             polish = replace(polish, secant=secant)
     return replace(
         state,

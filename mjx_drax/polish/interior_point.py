@@ -87,9 +87,10 @@ TRIES = 3
 NEAR = 0.02
 """Residual below which the curvature that stages have learned is used."""
 
-PATIENCE, MEASURED = 3.0, 1.5
-"""Where f is smooth: after so many iterations for each number of a stage near an optimum, where
-as many rank-one updates could have learned all, curvature is measured once in MEASURED."""
+CLOSE, PATIENCE, MEASURED = 0.1, 3.0, 1.5
+"""Where f is smooth: a chain whose residual was below CLOSE for PATIENCE n iterations is slow, as n
+rank-one updates could have taught its stages all, n = ndx + nu. Then curvature is measured, once in
+MEASURED n iterations, and used below CLOSE."""
 
 BLOCKED, RAISE = 0.1, 3.0
 """Steps to the boundary shorter than BLOCKED raise the barrier's weight by a factor RAISE."""
@@ -264,11 +265,12 @@ def _measured(
     residual: Residual,
     scales: Scales,
 ) -> Secant:
-    """What stages have learned; measured now and then where a chain is near an optimum for long."""
+    """What stages have learned; measured now and then where a chain is slow (CLOSE)."""
     polish, n = state.polish, len(scales.x) + len(scales.u)
-    near = jnp.where(residual.total < NEAR, learned.near + 1, 0)
-    now = polish.iterations % math.ceil(MEASURED * n) == 0
-    due = polish.active & (near > PATIENCE * n) & now
+    close = residual.total < CLOSE
+    learned = replace(learned, close=learned.close + close)
+    turn = polish.iterations % math.ceil(MEASURED * n) == 0
+    due = polish.active & close & turn & _slow(learned)
 
     def measure(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         at = state.trajectory, state.multipliers
@@ -279,7 +281,12 @@ def _measured(
     # a loop of one round, which a batch skips where no row needs it
     kept = learned.B, jnp.zeros((), bool)
     B, _ = jax.lax.while_loop(lambda carry: due & ~carry[1], measure, kept)
-    return replace(learned, B=B, near=near)
+    return replace(learned, B=B)
+
+
+def _slow(learned: Secant) -> Array:
+    """Whether a chain has been close to an optimum for longer than it should take to learn."""
+    return learned.close > PATIENCE * learned.B.shape[-1]
 
 
 def _entered(
@@ -350,7 +357,8 @@ def _moved(
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
     cost, learned = derivatives.cost, None
     if isinstance(now.secant, Secant):
-        learned = jnp.where(residual.total < NEAR, now.secant.B, 0.0)
+        used = residual.total < jnp.where(_slow(now.secant), CLOSE, NEAR)
+        learned = jnp.where(used, now.secant.B, 0.0)
     else:
         cost = with_exact_hessian(problem, knots, state.multipliers, cost, Autodiff())
     diagonal, _ = _diagonal(cost, scales)

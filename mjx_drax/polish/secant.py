@@ -9,7 +9,7 @@ After a step s = (dx_k, du_k), with the stage's Lagrangian l + lambda'f + nu'g a
 (the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984). It needs no derivatives
 beyond those that Gauss-Newton has anyway, so programs compile no longer for it. Far from an optimum
 what stages have learned is wrong one step later, so it is used near one only. Where a chain stays
-near one for long and f is smooth, B_k is measured now and then (`curvature`), and learns on.
+close to one for long and f is smooth, B_k is measured now and then (`curvature`), and learns on.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Secant:
         J: Jacobians of dynamics and constraints in (dx, du), (K, ndx + m, n).
         g: gradient of the running cost, (K, n).
         x, u: x_0..x_{K-1} and controls, (K, nx) and (K, nu).
-        near: for how many iterations the chain has been near an optimum.
+        close: for how many iterations the chain has been close to an optimum.
     """
 
     B: Array
@@ -50,7 +50,7 @@ class Secant:
     g: Array
     x: Array
     u: Array
-    near: Array
+    close: Array
 
     @classmethod
     def none(cls, problem: Problem) -> Secant:
@@ -59,7 +59,7 @@ class Secant:
         n, rows = dynamics.ndx + dynamics.nu, dynamics.ndx + problem.constraint.rows
         shapes = (K, n, n), (K, rows, n), (K, n), (K, dynamics.nx), (K, dynamics.nu)
         B, J, g, x, u = map(jnp.zeros, shapes)
-        return cls(B, J, g, x, u, near=jnp.zeros((), int))
+        return cls(B, J, g, x, u, close=jnp.zeros((), int))
 
     def updated(
         self,
@@ -83,7 +83,7 @@ class Secant:
         noise = NOISE * jnp.finfo(g.dtype).eps * terms
         learned = jax.vmap(_rank_one)(self.B, blocks(cost) + self.B, s, y, noise)
         B = jnp.where(learns, learned, self.B)
-        return Secant(B, J, g, x, knots.u, self.near)
+        return Secant(B, J, g, x, knots.u, self.close)
 
 
 def with_curvature(cost: QuadraticCost, B: Array) -> QuadraticCost:
