@@ -8,6 +8,7 @@ in tangent space, at fixed multipliers. It may be indefinite.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_drax.method.model import Multipliers, QuadraticCost
-from mjx_drax.problem.differentiators import Differences, Differentiator
+from mjx_drax.problem.differentiators import Differentiator, Function, second_differences
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Knot, Trajectory
 
@@ -31,7 +32,7 @@ def with_exact_hessian(
     dynamics, rows = problem.dynamics, multipliers.constraints
     ndx = dynamics.ndx
     by = dynamics.step_differentiator(by)
-    H = _of_stages(problem, knots, multipliers, by)
+    H = _of_stages(problem, knots, multipliers, by.hessian)
     last = problem.end
 
     def end(dx: Array) -> Array:
@@ -63,14 +64,17 @@ def measured_hessian(
     box, margin = problem.bounds, 2.0 * share * u  # two directions of one control at once, at most
     margin = jnp.minimum(margin, 0.5 * (box.u_upper - box.u_lower))
     inside = replace(knots, u=jnp.clip(knots.u, box.u_lower + margin, box.u_upper - margin))
-    by = Differences(share * jnp.concatenate([x, u]))
-    return _of_stages(problem, inside, multipliers, by)
+    steps = share * jnp.concatenate([x, u])
+    return _of_stages(problem, inside, multipliers, lambda f, _: second_differences(f, steps))
 
 
 def _of_stages(
-    problem: Problem, knots: Trajectory, multipliers: Multipliers, by: Differences | Differentiator
+    problem: Problem,
+    knots: Trajectory,
+    multipliers: Multipliers,
+    hessian: Callable[[Function, int], Array],
 ) -> Array:
-    """H_k, (K, n, n)."""
+    """H_k of the stages, (K, n, n), each the `hessian` of a function dz (n,) -> scalar."""
     dynamics, rows = problem.dynamics, multipliers.constraints
     ndx, nu = dynamics.ndx, dynamics.nu
 
@@ -84,7 +88,7 @@ def _of_stages(
             constrained = jnp.dot(force, here.constraint(*seen))
             return here.running(*seen) + jnp.dot(lambda_, defect) + constrained
 
-        return by.hessian(lagrangian, ndx + nu)
+        return hessian(lagrangian, ndx + nu)
 
     of_stages: Array = jax.vmap(stage)(
         *problem.stages(knots), knots.x, multipliers.dynamics, rows.stage

@@ -112,39 +112,35 @@ class Smoothed:
         return jnp.zeros((size, size))
 
 
-@register_dataclass
-@dataclass(frozen=True)
-class Differences:
-    """Hessians by central differences, exact up to third derivatives, from n^2 + n + 2 values.
+def second_differences(function: Function, steps: Array) -> Array:
+    """The Hessian (n, n) at dz = 0 of a function dz (n,) -> scalar, from n^2 + n + 2 values.
 
         H_ii = [ s(h_i e_i) - s(0) ] / h_i^2,        s(z) = f(z) + f(-z)
         H_ij = [ s(h_i e_i + h_j e_j) - s(h_i e_i) - s(h_j e_j) + s(0) ] / (2 h_i h_j)
 
-    The function is compiled once, as it is, where exact second derivatives may take minutes.
+    Exact up to third derivatives. The function is compiled once, as it is, where exact second
+    derivatives may take minutes.
 
-    Attributes:
-        steps: h, (at least n,).
+    Args:
+        function: of a displacement.
+        steps: h, (n,), in the units of the displacement.
     """
+    h, size = steps, len(steps)
+    i, j = np.tril_indices(size, -1)
+    alone = jnp.diag(h)
+    points = jnp.concatenate([jnp.zeros((1, size)), alone, alone[i] + alone[j]])
+    lean = pruned(function)
 
-    steps: Array
+    def of_both_signs(rows: Array) -> Array:
+        return jax.vmap(lambda dz: lean(dz) + lean(-dz))(rows)
 
-    def hessian(self, function: Function, size: int) -> Array:
-        """Hessian (n, n)."""
-        h, (i, j) = self.steps[:size], np.tril_indices(size, -1)
-        alone = jnp.diag(h)
-        points = jnp.concatenate([jnp.zeros((1, size)), alone, alone[i] + alone[j]])
-        lean = pruned(function)
-
-        def of_both_signs(rows: Array) -> Array:
-            return jax.vmap(lambda dz: lean(dz) + lean(-dz))(rows)
-
-        # n points at a time need as much memory as a Jacobian's tangents
-        filled = jnp.pad(points, ((0, -len(points) % size), (0, 0)))
-        s = jax.lax.map(of_both_signs, filled.reshape(-1, size, size)).ravel()
-        single, pairs = s[1 : size + 1], s[size + 1 : len(points)]
-        H = jnp.diag((single - s[0]) / jnp.square(h))
-        mixed = (pairs - single[i] - single[j] + s[0]) / (2.0 * h[i] * h[j])
-        return H.at[i, j].set(mixed).at[j, i].set(mixed)
+    # n points at a time need as much memory as a Jacobian's tangents
+    filled = jnp.pad(points, ((0, -len(points) % size), (0, 0)))
+    s = jax.lax.map(of_both_signs, filled.reshape(-1, size, size)).ravel()
+    single, pairs = s[1 : size + 1], s[size + 1 : len(points)]
+    H = jnp.diag((single - s[0]) / jnp.square(h))
+    mixed = (pairs - single[i] - single[j] + s[0]) / (2.0 * h[i] * h[j])
+    return H.at[i, j].set(mixed).at[j, i].set(mixed)
 
 
 def positive_part(matrix: Array) -> Array:

@@ -765,8 +765,7 @@ class Search:
         """Replays of chains, and which of them miss the goal; without one, which leave the plan."""
         knots, family = chains.state.trajectory, self.family
         gains = with_feedback * np.asarray(chains.state.gains)
-        plan = np.concatenate([family.starts(self.indices, knots)[:, None], knots.x], axis=1)
-        ran = family.tracked(self.indices, plan, np.asarray(knots.u), gains)
+        ran = family.tracked(self.indices, self._plans(knots), np.asarray(knots.u), gains)
         if family.problem.goal is None:
             return ran, ran.left
         return ran, ~family.reached(ran.states)
@@ -786,6 +785,10 @@ class Search:
             missed = missed & chains.missed
         return best_of(replace(chains, missed=missed), found, np.arange(len(x)))
 
+    def _plans(self, knots: Trajectory) -> np.ndarray:
+        """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""
+        return np.concatenate([self.family.starts(self.indices, knots)[:, None], knots.x], axis=1)
+
     def _by_the_engine(self, info: Info, knots: Trajectory, won: np.ndarray) -> Info:
         """Diagnostics of rollouts; max|h| of those that won (rows,) as the replaying engine has it.
 
@@ -797,7 +800,7 @@ class Search:
         if not (family.problem.dynamics.kinked and len(which)):
             return info
         broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
-        plan = np.concatenate([family.starts(self.indices, knots)[:, None], knots.x], axis=1)
+        plan = self._plans(knots)
         for row in which.tolist():
             problem = family.at(int(self.indices[row // self.chains]))
             off = problem.engine_defects(plan[row], np.asarray(knots.u[row]))
