@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import Bouncing, arm, made_up, point, robot
+from builders import Bouncing, made_up, point
 from jax.tree_util import Partial
 
 from mjx_drax import (
