@@ -52,7 +52,7 @@ MAPS = Path("/proc/self/maps")
 def few_programs():
     """Forget compiled programs before there are too many, which ends a process in compilers."""
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 25_000:
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 40_000:
         jax.clear_caches()
         gc.collect()
 

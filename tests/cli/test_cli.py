@@ -182,6 +182,7 @@ def test_status_is_1_when_not_certified(tmp_path, capsys):
     assert not (tmp_path / "video.mp4").exists()
 
 
+@pytest.mark.slow
 def test_the_plan_is_filmed_too_if_nothing_is_certified(slider, tmp_path, monkeypatch):
     films = []
     monkeypatch.setattr(

@@ -245,7 +245,9 @@ def numbers(state):
 NOISY = Langevin(iterations=14, tail=6)
 
 
-@pytest.mark.parametrize("preconditioner", [GaussNewton(), Identity()])
+@pytest.mark.parametrize(
+    "preconditioner", [pytest.param(GaussNewton(), marks=pytest.mark.slow), Identity()]
+)
 def test_chunks_do_not_matter(preconditioner):
     solver, problem = replace(NOISY, preconditioner=preconditioner, step_size=1e-3), program()
     state = start(solver, problem, chains=3)

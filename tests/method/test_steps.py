@@ -59,14 +59,8 @@ def test_large_steps_sample_their_own_gaussian_and_adjusted_ones_the_right_one()
     assert_gaussian(sampled(replace(solver, adjusted=True), 300), BOLTZMANN)
 
 
-@pytest.mark.parametrize(
-    ("alpha", "damping"),
-    [
-        pytest.param(0.05, 0.0, marks=pytest.mark.slow),
-        pytest.param(0.8, 0.0, marks=pytest.mark.slow),
-        (0.5, 1.0),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("alpha", "damping"), [(0.05, 0.0), (0.8, 0.0), (0.5, 1.0)])
 def test_gauss_newton_samples_the_gaussian_of_its_step_size(alpha, damping):
     # With M = Q + delta: S = sigma^2 Q^-1 (1 - alpha M^-1 Q / 2)^-1
     solver = replace(NOISY, step_size=alpha, damping=Constant(damping))
@@ -132,7 +126,9 @@ CORNER = np.array([0.0, 1.0])  # the gradient there is (0.2, -2)
 
 
 @pytest.mark.parametrize("bounds", [LogBarrier(), Projection(), Reflection()])
-@pytest.mark.parametrize("preconditioner", [Identity(), GaussNewton()])
+@pytest.mark.parametrize(
+    "preconditioner", [Identity(), pytest.param(GaussNewton(), marks=pytest.mark.slow)]
+)
 def test_every_noisy_step_stays_inside_and_the_optimum_is_found(bounds, preconditioner):
     solver = Langevin(
         preconditioner=preconditioner,

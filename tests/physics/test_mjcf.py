@@ -89,7 +89,8 @@ def c_jacobian(model, x, u, substeps, eps=1e-5):
 
 
 @pytest.mark.parametrize(
-    "model", ["pendulum", "cartpole", pytest.param("acrobot", marks=pytest.mark.slow)]
+    "model",
+    ["pendulum", *(pytest.param(m, marks=pytest.mark.slow) for m in ("cartpole", "acrobot"))],
 )
 def test_step_and_jacobians_are_the_c_engines_in_float64(model):
     with jax.enable_x64(True):
@@ -282,11 +283,16 @@ STILL = '<mujoco model="rock"><worldbody><geom size="1"/></worldbody></mujoco>'
         (arm(world=FREE), (18, 17), False),
         (arm(world=BALL), (12, 11), False),
         (arm(world=FLOOR, contact=True), (5, 5), True),
-        (arm(more=COUPLED), (5, 5), True),
-        (arm(joint='frictionloss="0.1"'), (5, 5), True),
-        (arm(more=STRING), (5, 5), True),
+        pytest.param(arm(more=COUPLED), (5, 5), True, marks=pytest.mark.slow),
+        pytest.param(arm(joint='frictionloss="0.1"'), (5, 5), True, marks=pytest.mark.slow),
+        pytest.param(arm(more=STRING), (5, 5), True, marks=pytest.mark.slow),
         (arm(joint='range="-90 90" limited="true" margin="0.1"'), (5, 5), False),
-        (arm(joint='range="-1 1" limited="true"', actuator=MOTOR), (4, 4), True),
+        pytest.param(
+            arm(joint='range="-1 1" limited="true"', actuator=MOTOR),
+            (4, 4),
+            True,
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["plain", "free", "ball", "contact", "equal", "friction", "tendon", "margin", "passive"],
 )

@@ -4,12 +4,15 @@ MJCF goes to MuJoCo's own parser, in C++: four thousand mutations of a model wer
 of their own and none of them ended it.
 """
 
+import pytest
 from builders import arm, outcome, robot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import anything, bounded
 
 from mjx_drax.physics.source import load
+
+pytestmark = pytest.mark.slow
 
 NUMBERS = ("x_init", "horizon", "dt", "x_bounds", "u_bounds", "x_scatter", "u_scatter")
 

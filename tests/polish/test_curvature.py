@@ -53,7 +53,7 @@ def derivatives(problem, knots, multipliers):
     """First derivatives, and Gauss-Newton's Hessian."""
     weights = Weights(*map(jnp.asarray, (0.0, 1.0, 0.0, 0.0)))
     at = problem, LogBarrier(), knots, multipliers, weights, Autodiff(), jax.random.key(0)
-    return expand(*at).derivatives
+    return jax.jit(lambda: expand(*at).derivatives)()
 
 
 @pytest.fixture(autouse=True)
@@ -138,9 +138,10 @@ def test_differences_measure_the_hessian_and_stay_away_from_where_controls_are_c
     knots, multipliers = somewhere(whole, 1)
     knots = replace(knots, u=jnp.array([[0.5], [-0.5], [0.1]]))
     cost = derivatives(whole, knots, multipliers).cost
-    exact = with_exact_hessian(whole, knots, multipliers, cost, Autodiff())
+    exact = jax.jit(with_exact_hessian)(whole, knots, multipliers, cost, Autodiff())
     for problem in (whole, cut_off):
-        H = measured_hessian(problem, knots, multipliers, jnp.ones(NX), 2.0 * jnp.ones(NU))
+        ones = jnp.ones(NX), 2.0 * jnp.ones(NU)
+        H = jax.jit(measured_hessian)(problem, knots, multipliers, *ones)
         np.testing.assert_allclose(H, stage_blocks(exact), atol=0.01)
         np.testing.assert_allclose(H[2], stage_blocks(exact)[2], atol=1e-5)  # inside
 

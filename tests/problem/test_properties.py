@@ -1,12 +1,15 @@
 """Any argument makes a problem, or a DraxError says why not; nothing else is raised."""
 
 import numpy as np
+import pytest
 from builders import outcome, point
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import anything, bounded
 
 from mjx_drax import DraxError, from_function
+
+pytestmark = pytest.mark.slow
 
 ARGUMENTS = ("x_init", "horizon", "dt", "nu", "x_bounds", "u_bounds", "x_scatter", "u_scatter")
 FUNCTIONS = ("f", "running_cost", "terminal_residual", "equality", "inequality", "goal", "guess")

@@ -122,6 +122,7 @@ def whole_batch():
 # The answer
 
 
+@pytest.mark.slow
 def test_the_same_call_gives_the_same_answer(whole, whole_batch):
     assert_same(solved(), whole)
     assert_same(batch(), whole_batch)

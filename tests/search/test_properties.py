@@ -1,5 +1,6 @@
 """Any setting is accepted, or a DraxError says why not; nothing else is raised."""
 
+import pytest
 from builders import outcome, point
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,6 +10,8 @@ from mjx_drax import Constant, DraxError, Geometric, Langevin, Restarts, Traject
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.restarts import settled
 from mjx_drax.search.settings import changed, names
+
+pytestmark = pytest.mark.slow
 
 
 @bounded

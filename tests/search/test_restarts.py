@@ -72,14 +72,8 @@ def swing(weight=1.0):
     )
 
 
-@pytest.mark.parametrize(
-    ("start", "coolings"),
-    [
-        pytest.param(6.0, 0, marks=pytest.mark.slow),
-        (1e3, 2),
-        pytest.param(1e4, 3, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("start", "coolings"), [(6.0, 0), (1e3, 2), (1e4, 3)])
 def test_an_attempt_that_noise_throws_away_starts_again_with_less(start, coolings):
     solver = Restarts(attempts=2, enough=1.1)  # always with noise
     solver = replace(solver, flow=replace(solver.flow, noise=Geometric(start, 1.5e-3)))
@@ -274,6 +268,7 @@ def test_a_tolerance_and_iterations_of_the_polish_are_arguments(balls):
     assert settled(kinked, 4, 0, None, 1e-3).polish == Polish(1e-3)
 
 
+@pytest.mark.slow
 def test_a_looser_tolerance_ends_sooner_and_judges_what_is_optimal():
     once = partial(minimize, PROGRAM, chains=8, solver=Restarts(SHORT, attempts=1))
     loose, tight = (once(tolerance=t) for t in (1e-1, 1e-4))
@@ -325,7 +320,9 @@ class Heavier(FunctionDynamics):
     ("fastest", "goal", "keeps"),
     [
         (5.0, lambda x: abs(x[0] - 1.0) < 0.3, True),
-        (0.5, lambda x: abs(x[0] - 1.0) < 0.3, False),  # it breaks a constraint
+        pytest.param(  # it breaks a constraint
+            0.5, lambda x: abs(x[0] - 1.0) < 0.3, False, marks=pytest.mark.slow
+        ),
         pytest.param(5.0, None, False, marks=pytest.mark.slow),
     ],
 )

@@ -22,7 +22,10 @@ from mjx_drax import (
 from mjx_drax.cli import main
 from mjx_drax.view.plotting import plot_solution
 
-pytestmark = pytest.mark.filterwarnings("error")  # JAX warns where float64 is cut to float32
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("error"),  # JAX warns where float64 is cut to float32
+]
 
 DT = 0.2
 GAIN = np.array([[0.7]])  # JAX sees it in float32 first
@@ -105,7 +108,6 @@ def test_it_is_saved_and_loaded_in_float64(problem, solution, tmp_path):
     save_csv(loaded, tmp_path / "replay.csv")
 
 
-@pytest.mark.slow
 def test_a_guess_and_another_attempt_stay_in_float64(problem):
     guess = Trajectory(np.zeros((10, 2)), np.zeros((10, 1)))
     eager = Restarts(descent=20, attempts=2, enough=2.0)
@@ -114,7 +116,6 @@ def test_a_guess_and_another_attempt_stay_in_float64(problem):
     assert found.residual.max() < 1e-8
 
 
-@pytest.mark.slow
 def test_a_model_reaches_1e_8(rail, tmp_path):
     problem, solution = rail
     assert solution.tolerance == 1e-8
@@ -130,7 +131,6 @@ def test_a_model_reaches_1e_8(rail, tmp_path):
         np.testing.assert_array_equal(loaded.replayed[0], solution.replayed[0])
 
 
-@pytest.mark.slow
 def test_batches_reach_1e_8(problem):
     starts = np.array([[0.0, 0.0], [0.1, 0.0]])
     batch = solve_batch(
@@ -142,7 +142,6 @@ def test_batches_reach_1e_8(problem):
     assert_double(batch.x, batch.u, batch.cost)
 
 
-@pytest.mark.slow
 def test_programs_reach_1e_8():
     program = from_program(2, cost=lambda x: (x[0] - 1) ** 2 + 9 * (x[1] - x[0] ** 2) ** 2)
     found = minimize(program, chains=2, solver=ONCE, precision=64)
@@ -150,7 +149,6 @@ def test_programs_reach_1e_8():
     np.testing.assert_allclose(found.x, 1.0, atol=1e-6)
 
 
-@pytest.mark.slow
 def test_the_command_makes_the_problem_in_float64(tmp_path, capsys):
     words = "solve pendulum --horizon 1 --chains 2 --iterations 4 --no-video --quiet"
     main([*words.split(), "--precision", "64", "--residual", "1e-7", "--out", str(tmp_path)])

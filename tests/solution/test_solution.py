@@ -278,6 +278,7 @@ def test_gains_come_even_where_the_preconditioner_factorizes_nothing():
     assert (solution.gains[:, :-1] < 0).all()  # pushes back, at every knot that still matters
 
 
+@pytest.mark.slow
 def test_same_seed_same_solution():
     first, again, other = (solve(reach(), chains=3, seed=s, solver=QUICK) for s in (0, 0, 1))
     np.testing.assert_array_equal(first.trajectories.x, again.trajectories.x)
@@ -398,7 +399,9 @@ def test_a_models_cost_that_is_nan_everywhere_is_refused(no_compilation):
             solve(problem, chains=3, solver=QUICK)
 
 
-@pytest.mark.parametrize("solver", [None, Langevin(iterations=1000)])
+@pytest.mark.parametrize(
+    "solver", [pytest.param(None, marks=pytest.mark.slow), Langevin(iterations=1000)]
+)
 def test_nan_away_from_x_init_ends_the_solve_and_names_the_knot(solver):
     edge = reach(
         running_cost=lambda x, u: 10.0 * (x[0] - 3.0) ** 2 - 0.1 * jnp.sqrt(0.5 - x[0]),

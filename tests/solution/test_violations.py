@@ -29,7 +29,8 @@ from mjx_drax.view import plotting
 from mjx_drax.view.video import outcome_lines
 
 K, DT = 10, 0.2
-UNITS = [(1.0, 1.0), (1e3, 1.0), (1e-3, 1e4), (1.0, 1e-6)]
+OTHERS = [(1.0, 1.0), (1e3, 1.0), (1.0, 1e-6)]
+UNITS = [(1e-3, 1e4), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in OTHERS)]
 """Units of length and of the values of a constraint."""
 
 

@@ -347,6 +347,7 @@ def test_own_dynamics_are_solved_certified_and_come_back(swung, tmp_path):
         cluster(dynamics, alone.trajectories.x)
 
 
+@pytest.mark.slow
 def test_mpc_takes_own_dynamics_metric_bounds_and_schedule(swung, mine):
     solver = SOLVER
     for name, text in (

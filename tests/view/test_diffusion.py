@@ -40,6 +40,7 @@ def _snapshot(iteration: int, cost: list[float], max_defect: list[float]) -> Sna
     return Snapshot(iteration, 0.0, x, *arrays)
 
 
+@pytest.mark.slow
 def test_recording_does_not_change_the_answer(trapped: Solution) -> None:
     plain = solve(load("bug_trap").make(horizon=1.0), chains=3, solver=SHORT)
     np.testing.assert_array_equal(plain.trajectories.x, trapped.trajectories.x)
