@@ -152,9 +152,6 @@ PROBLEMS = {
     },
     "cartpole_swingup": {"task": cartpole_swingup.make, "chains": 16},
 }
-QUICK = ("line",)
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name not in QUICK]
-ALL = [*QUICK, *SLOW]
 SAME = {"cost x 1e-6": {"weight": 1e-6}, "cost x 1e6": {"weight": 1e6}}
 SAME |= {"+ 1000": {"constant": 1e3}, "- 1000": {"constant": -1e3}, "mm": {"millimetres": True}}
 WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
@@ -215,8 +212,9 @@ def mirrored(name, z):
     return x * of_x, u * of_u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", SAME)
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_the_same_motion_comes_out(name, change):
     if change == "mm" and "unit" not in PROBLEMS[name]:
         pytest.skip("its model is a file in metres")
@@ -235,7 +233,7 @@ def test_the_same_motion_comes_out(name, change):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_the_answer_to_each_terminal_weight_is_the_cheapest_at_that_weight(name):
     # At 1e6 the swing-up's is 5e8 times the running weight: too much for float32
     weights = WEIGHTS[:-1] if name == "cartpole_swingup" else WEIGHTS

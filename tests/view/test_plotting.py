@@ -17,19 +17,12 @@ from PIL import Image
 from mjx_drax.base.errors import DraxError
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.search.restarts import Restarts
 from mjx_drax.solution.replay import WITH_FEEDBACK
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 from mjx_drax.view import labels, phase_plots, plotting
 from mjx_drax.view.plotting import plot_solution
-
-
-@pytest.fixture(scope="module")
-def pendulum() -> Solution:
-    settings = Restarts(Langevin(iterations=30, tail=20), descent=30, attempts=1)
-    return solve(load("pendulum").make(), chains=8, solver=settings)
 
 
 def _size(path: Path) -> tuple[int, int]:

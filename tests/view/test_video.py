@@ -18,12 +18,8 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.method.langevin import Langevin
 from mjx_drax.physics.states import interpolated
-from mjx_drax.search.restarts import Restarts
 from mjx_drax.solution.solution import Solution
-from mjx_drax.solution.solve import solve
-from mjx_drax.tasks import load
 from mjx_drax.view import renderer, video
 from mjx_drax.view.frames import DARK, caption_height
 from mjx_drax.view.scene import camera_for
@@ -66,12 +62,6 @@ def _distance(one: np.ndarray, other: np.ndarray) -> int:
 def _draw_angle(axes: Axes, states: np.ndarray) -> None:
     axes.plot(np.sin(states[:, 0]), np.cos(states[:, 0]), "o-")
     axes.set(xlim=(-2, 2), ylim=(-2, 2), aspect="equal")
-
-
-@pytest.fixture(scope="module")
-def pendulum() -> Solution:
-    settings = Restarts(Langevin(iterations=30, tail=20), descent=30, attempts=1)
-    return solve(load("pendulum").make(horizon=1.0), chains=8, solver=settings)
 
 
 def _judged(solution: Solution, feasible: bool, open_loop: bool, feedback: bool) -> Solution:
