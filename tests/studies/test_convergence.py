@@ -283,16 +283,33 @@ def test_rows_become_lines_with_or_without_ipopt():
     assert suite.line(row).endswith("| 6 | 1 | 2e-09 | optimal | 1.50 |")
 
 
+NAMES = ["pendulum, 50 of the flow", "pendulum, 100 of the flow"]
+
+
 def test_ratio_is_of_iterations(monkeypatch):
     problem, knots = suite.posed("hs006")
     monkeypatch.setattr(suite, "posed", lambda name: (problem, knots))
     monkeypatch.setattr(suite, "has_casadi", lambda: True)
     answer = ipopt_jax.Answer(Trajectory(knots.x, knots.u), 8, 1.0, 0.0, "Solve_Succeeded")
     monkeypatch.setattr(ipopt_jax, "solve", lambda *_: answer)
-    monkeypatch.setattr(suite, "ours", lambda *_: (12, 1e-9, 1.0, "optimal"))
-    row = suite.measure("hs006")
+    monkeypatch.setattr(suite, "ours", lambda _, __, flow: (12 + flow, 1e-9, 1.0, "optimal"))
+    (row,) = suite.measure("hs006")
     assert (row["ipopt_iterations"], row["iterations"], row["ratio"]) == (8, 12, 1.5)
     assert (row["numbers"], row["optimum"]) == (2, 0.0)
+    rows = suite.measure("pendulum")
+    assert [row["problem"] for row in rows] == ["pendulum", *NAMES]
+    assert [row["iterations"] for row in rows] == [12, 62, 112]
+    assert [row["ratio"] for row in rows] == [1.5, 7.75, 14.0]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float64")
+def test_the_flow_and_the_polish_reach_the_tolerance_together():
+    found = [suite.ours(*suite.posed("pendulum"), flow) for flow in suite.DESCENTS]
+    assert [status for *_, status in found] == ["optimal"] * 3
+    assert all(residual < suite.TOLERANCE for _, residual, *_ in found)
+    assert [cost for *_, cost, _ in found] == pytest.approx([0.0317737] * 3, rel=1e-4)
+    assert all(n > flow for (n, *_), flow in zip(found, suite.DESCENTS, strict=True))
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@
               their box; for programs the starting point of the book
     optimum   the published cost of the continuous problem, where it is known; that of the program
               differs by what its knots add, see `Case.error`
+    method    the polish; for tasks also the polish after some of the noise-free flow, as in `solve`
     IPOPT     the same program from the same guess, exact derivatives, tol 1e-8, at most 500
               iterations; left out if casadi is not installed
 
@@ -31,11 +32,12 @@ import numpy as np
 from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import write_json
-from mjx_drax.method.langevin import Langevin
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.iterate import Question, begin, iterate, partition
+from mjx_drax.search.restarts import Restarts, scale_of
+from mjx_drax.search.sizes import scale_and_floor, sizes_of
 from mjx_drax.studies.convergence import open_problems, optimal_control
 from mjx_drax.studies.convergence.optimal_control import straight
 from mjx_drax.studies.convergence.programs import PROGRAMS
@@ -51,6 +53,9 @@ NAME = "convergence"
 
 TOLERANCE, LONGEST = 1e-8, 500
 """Of both methods: on the residual, and the largest number of iterations."""
+
+DESCENTS = 0, 50, 100
+"""Iterations of the flow before the polish, which are counted; `solve` makes 100."""
 
 TASKS: dict[str, Sequence[float] | None] = {
     "pendulum": [0.0, 0.0],
@@ -91,20 +96,25 @@ def posed(name: str) -> tuple[Problem, Trajectory]:
     raise DraxError(f"the suite convergence has no {name}: it has {', '.join(names())}.")
 
 
-def ours(problem: Problem, knots: Trajectory) -> tuple[int, float, float, str]:
-    """Iterations, scaled KKT residual, cost and status of this library's local method."""
-    flow, polish = Langevin(iterations=0), Polish(TOLERANCE, LONGEST)
-    shared, own = partition(Question(flow, problem, polish=polish), None)
+def ours(problem: Problem, knots: Trajectory, descent: int = 0) -> tuple[int, float, float, str]:
+    """Iterations, scaled KKT residual, cost and status of so much of the flow, and the polish."""
+    polish, flow = Polish(TOLERANCE, LONGEST), replace(Restarts().first(1.0), iterations=descent)
     start = jax.tree.map(lambda a: jnp.asarray(a, float)[None], knots)
+    shared, own = partition(Question(flow, problem, polish=polish), None)
     states = begin(own, shared, start, jax.random.key(0))
-    states, info = iterate((states, own), shared, 0, LONGEST)
+    if descent:
+        cost, _ = scale_and_floor(jax.tree.map(np.asarray, sizes_of(own, shared, start)), True)
+        flow = replace(flow, scale=scale_of(cost, 0.0))
+        shared, own = partition(Question(flow, problem, polish=polish), None)
+    states, info = iterate((states, own), shared, 0, descent + LONGEST)
     done = states.polish
     status = "optimal" if done.optimal[0] else "stalled" if done.stalled[0] else "out of iterations"
-    return int(done.iterations[0]), float(info.residual[0]), float(info.cost[0]), status
+    iterations = descent + int(done.iterations[0])
+    return iterations, float(info.residual[0]), float(info.cost[0]), status
 
 
-def measure(name: str) -> Row:
-    """A row of the table. Needs `jax_enable_x64`."""
+def measure(name: str) -> list[Row]:
+    """Rows of the table, for a task one for each of `DESCENTS`. Needs `jax_enable_x64`."""
     problem, knots = posed(name)
     sizes = (int(leaf.size) for leaf in jax.tree.leaves(knots))
     row: Row = {"problem": name, "numbers": sum(sizes)}
@@ -118,14 +128,19 @@ def measure(name: str) -> Row:
             "ipopt_cost": answer.cost,
             "ipopt_status": answer.status,
         }
-    try:
-        iterations, residual, cost, status = ours(problem, knots)
-    except NotImplementedError:
-        return row
-    row |= {"iterations": iterations, "residual": residual, "cost": cost, "status": status}
-    if row.get("ipopt_iterations"):
-        row["ratio"] = iterations / row["ipopt_iterations"]
-    return row
+    rows = []
+    for descent in DESCENTS if name in TASKS else (0,):
+        try:
+            iterations, residual, cost, status = ours(problem, knots, descent)
+        except NotImplementedError:
+            return [row]
+        rows.append(row | {"iterations": iterations, "residual": residual})
+        rows[-1] |= {"cost": cost, "status": status}
+        if descent:
+            rows[-1]["problem"] += f", {descent} of the flow"
+        if row.get("ipopt_iterations"):
+            rows[-1]["ratio"] = iterations / row["ipopt_iterations"]
+    return rows
 
 
 def line(row: Row) -> str:
@@ -182,5 +197,6 @@ def _rows(chosen: Sequence[str]) -> Iterator[Row]:
 
 if __name__ == "__main__":
     for each in sys.argv[1:]:
-        print(json.dumps(measure(each)), flush=True)
+        for one in measure(each):
+            print(json.dumps(one), flush=True)
         jax.clear_caches()  # a process may map only so many programs into its memory
