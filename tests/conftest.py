@@ -63,7 +63,7 @@ def models_are_trusted(request):
     if "physics" in request.path.parts:
         yield
         return
-    from mjx_drax.physics.checks import Findings, StepErrors
+    from mjx_drax.physics.agreement.checks import Findings, StepErrors
 
     def nothing(*_):
         return Findings(StepErrors(np.zeros(1)), (), None)

@@ -17,10 +17,10 @@ import numpy as np
 from mjx_drax.base.errors import DraxError
 from mjx_drax.physics._mjx import COLLISIONS, geom_pairs, internal, mjx
 from mjx_drax.physics.actuators import disabled, driven
-from mjx_drax.physics.collision import extended, hulls, make_data, signature
+from mjx_drax.physics.contacts.collision import extended, hulls, make_data, signature
+from mjx_drax.physics.contacts.pairs import Contacts, Pair, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
-from mjx_drax.physics.pairs import Contacts, Pair, geom_name, left_out
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}

@@ -7,10 +7,10 @@ import warnings
 import numpy as np
 
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.physics.checks import samples
-from mjx_drax.physics.collision import BOX, MESH
+from mjx_drax.physics.agreement.checks import samples
+from mjx_drax.physics.contacts.collision import BOX, MESH
+from mjx_drax.physics.contacts.pairs import Contacts, Pair, contact_pairs, geom_name
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.pairs import Contacts, Pair, contact_pairs, geom_name
 from mjx_drax.physics.states import Engine, quiet, set_state
 
 MOST_WORK = 2_000_000

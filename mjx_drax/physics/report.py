@@ -10,8 +10,9 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.physics.actuators import largest_moment_arms
-from mjx_drax.physics.checks import Findings, checked_start, examine, require_traceable
-from mjx_drax.physics.differences import differences
+from mjx_drax.physics.agreement.checks import Findings, checked_start, examine, require_traceable
+from mjx_drax.physics.agreement.differences import differences
+from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjcf import steps_between_knots
@@ -23,7 +24,6 @@ from mjx_drax.physics.mjx_model import (
 )
 from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.near import affordable
-from mjx_drax.physics.pairs import Contacts, contact_pairs
 from mjx_drax.physics.source import load, model_name
 
 Report = dict[str, Any]

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mjx_drax.physics.contacts.pairs import Contacts, Pair, left_out
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.pairs import Contacts, Pair, left_out
 
 Floats = npt.NDArray[np.floating]
 

@@ -33,7 +33,7 @@ from mjx_drax.kernels.elliptic_cones import Cones
 from mjx_drax.kernels.linalg import solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import internal, mjx, with_internal
-from mjx_drax.physics.collision import collision, make_data
+from mjx_drax.physics.contacts.collision import collision, make_data
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import BALL, FREE, Joints
 from mjx_drax.physics.mjx_model import has_constraints

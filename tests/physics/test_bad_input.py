@@ -9,8 +9,8 @@ import pytest
 from builders import BALL, INF, NAN, At, arm, assert_complains, cases, robot
 
 from mjx_drax import Smoothed, from_mjcf, solve
-from mjx_drax.physics import checks
-from mjx_drax.physics.pairs import left_out
+from mjx_drax.physics.agreement import checks
+from mjx_drax.physics.contacts.pairs import left_out
 from mjx_drax.physics.report import check
 
 pytestmark = pytest.mark.usefixtures("nothing_iterates")

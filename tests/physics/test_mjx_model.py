@@ -11,8 +11,9 @@ import pytest
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.actuators import driven
-from mjx_drax.physics.checks import Samples, compare, examine
-from mjx_drax.physics.differences import differences, set_aside
+from mjx_drax.physics.agreement.checks import Samples, compare, examine
+from mjx_drax.physics.agreement.differences import differences, set_aside
+from mjx_drax.physics.contacts.pairs import contact_pairs
 from mjx_drax.physics.mjx_model import (
     MOST_CONTACTS,
     constraint_rows,
@@ -22,7 +23,6 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.observed import Observed
-from mjx_drax.physics.pairs import contact_pairs
 from mjx_drax.physics.states import Engine
 from mjx_drax.physics.step import data_at, forward, step
 from mjx_drax.physics.stepper import Stepper

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from mjx_drax.physics import polytopes
-from mjx_drax.physics.collision import polytope
+from mjx_drax.physics.contacts import polytopes
+from mjx_drax.physics.contacts.collision import polytope
 
 pytestmark = pytest.mark.slow
 

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax.physics import polytopes
 from mjx_drax.physics._mjx import COLLISIONS, collision_driver, mjx
-from mjx_drax.physics.collision import (
+from mjx_drax.physics.contacts import polytopes
+from mjx_drax.physics.contacts.collision import (
     CORNERS,
     collision,
     extended,

@@ -32,7 +32,6 @@ import numpy as np
 from jax import Array
 from scipy.spatial import ConvexHull, QhullError
 
-from mjx_drax.physics import curved, polytopes
 from mjx_drax.physics._mjx import (
     COLLISIONS,
     ConvexMesh,
@@ -42,6 +41,7 @@ from mjx_drax.physics._mjx import (
     mjx,
     with_internal,
 )
+from mjx_drax.physics.contacts import curved, polytopes
 from mjx_drax.physics.engine import mujoco
 
 _GEOM = mujoco.mjtGeom

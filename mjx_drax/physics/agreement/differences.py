@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjx_model import (
     LIMIT,
@@ -19,7 +20,6 @@ from mjx_drax.physics.mjx_model import (
     PAIRS,
     unknown_sensors,
 )
-from mjx_drax.physics.pairs import Contacts, contact_pairs, geom_name, left_out
 
 _DISABLE = mujoco.mjtDisableBit
 _PULLING = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
