@@ -779,7 +779,8 @@ class Search:
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
         own = np.zeros(len(x), bool)
         if self.family.problem.goal is not None:
-            own, info = missed, self._by_the_engine(info, rolled, ~missed)
+            ran_to = replace(gathered(state.trajectory, self.mesh), slack=None)
+            own, info = missed, self._by_the_engine(info, ran_to, ~missed)
         found = self._whole(Chains(state, info, np.full(len(x), done), own))
         if with_feedback:  # a plan is fine that is reached in one of two ways
             missed = missed & chains.missed

@@ -103,11 +103,20 @@ def chain_keys(key: Array, chains: int) -> Array:
 
 @jax.jit
 def restart_at(own: Question, shared: Question, states: State, knots: Trajectory) -> State:
-    """The chains with other knots (rows, K, ...), slacks that go with them, and a new polish."""
+    """The chains with other knots (rows, K, ...), slacks that go with them, and a new polish.
+
+    A polish brings knots inside their bounds as it begins; until then they may lie on them, as
+    controls of a rollout do. Without one they are brought inside here.
+    """
 
     def moved(q: Question, state: State, knots: Trajectory) -> State:
-        state = replace(state, trajectory=q.flow.inside(q.problem, knots))
-        return state if q.polish is None else interior_point.begin(q.problem, state)
+        inside = q.flow.inside(q.problem, knots)
+        if q.polish is None:
+            return replace(state, trajectory=inside)
+        knots = replace(knots, slack=None)
+        within = jax.tree.map(jnp.clip, knots, *q.problem.bounds.sides(knots))
+        state = replace(state, trajectory=replace(within, slack=inside.slack))
+        return interior_point.begin(q.problem, state)
 
     restarted: State = by_row(shared, own, moved, states, knots)
     return restarted

@@ -350,6 +350,19 @@ def test_a_rollout_that_reaches_the_goal_is_feasible_by_what_replays_it(fastest,
         np.testing.assert_allclose(found.trajectories.x, ran, atol=1e-5)
 
 
+def test_a_rollout_on_its_bounds_stays_there():
+    """Its max|h| belongs to these knots, not to those that a barrier would move inside."""
+    problem, key = swing(), jax.random.key(0)
+    shared, own = partition(Question(Restarts().flow, problem, polish=Polish(1e-4)), None)
+    knots = initial_knots(problem, 2, None, key)
+    state, upper = begin(own, shared, knots, key), problem.bounds.u_upper
+    on_bounds = replace(knots, u=jnp.broadcast_to(upper, knots.u.shape))
+    moved = restart_at(own, shared, state, on_bounds).trajectory
+    np.testing.assert_array_equal(moved.u, on_bounds.u)
+    beyond = restart_at(own, shared, state, replace(on_bounds, u=1.1 * on_bounds.u)).trajectory
+    np.testing.assert_array_equal(beyond.u, on_bounds.u)
+
+
 def two_balls(ball, rollouts=None, **changes):
     """A batch of the ball from two starts."""
     solver = Restarts(attempts=1, rollouts=rollouts, polish=changes.pop("polish", None))
