@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.kernels.pruning import pruned
+from mjx_drax.method.bounds import Projection
 from mjx_drax.method.descent import Info, diagnosed
 from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.langevin import Langevin, State, keep_finite
@@ -110,13 +111,9 @@ def restart_at(own: Question, shared: Question, states: State, knots: Trajectory
     """
 
     def moved(q: Question, state: State, knots: Trajectory) -> State:
-        inside = q.flow.inside(q.problem, knots)
-        if q.polish is None:
-            return replace(state, trajectory=inside)
-        knots = replace(knots, slack=None)
-        within = jax.tree.map(jnp.clip, knots, *q.problem.bounds.sides(knots))
-        state = replace(state, trajectory=replace(within, slack=inside.slack))
-        return interior_point.begin(q.problem, state)
+        flow = q.flow if q.polish is None else replace(q.flow, bounds=Projection())
+        state = replace(state, trajectory=flow.inside(q.problem, knots))
+        return state if q.polish is None else interior_point.begin(q.problem, state)
 
     restarted: State = by_row(shared, own, moved, states, knots)
     return restarted

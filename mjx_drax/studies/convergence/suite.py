@@ -134,12 +134,12 @@ def measure(name: str) -> list[Row]:
             iterations, residual, cost, status = ours(problem, knots, descent)
         except NotImplementedError:
             return [row]
-        rows.append(row | {"iterations": iterations, "residual": residual})
-        rows[-1] |= {"cost": cost, "status": status}
+        found = {"iterations": iterations, "residual": residual, "cost": cost, "status": status}
         if descent:
-            rows[-1]["problem"] += f", {descent} of the flow"
+            found["problem"] = f"{name}, {descent} of the flow"
         if row.get("ipopt_iterations"):
-            rows[-1]["ratio"] = iterations / row["ipopt_iterations"]
+            found["ratio"] = iterations / row["ipopt_iterations"]
+        rows.append(row | found)
     return rows
 
 
