@@ -52,8 +52,12 @@ ITERATIONS, SIZES = 20, 16
 DIGITS = 32.0
 """A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
-MOST_DOFS, MOST_ROWS, MOST_IN_CONES = 64, 128, 64
-"""Largest M and J of the kernel, and J with elliptic cones, whose kernel compiles for longer."""
+MOST_ROWS, MOST_IN_CONES = ((32, 512), (64, 128)), 64
+"""Most rows of J for which there is a kernel, up to so many columns; and those with elliptic cones.
+
+Where there are more, arrays are as fast or faster: 72 rows of Spot's cones, in 8,960 states, take
+90 ms in a kernel and 65 ms as arrays. 275 rows of a hand's contacts, in 1,600 states, take 26 ms in
+a kernel and 70 ms as arrays (one H100 with other work)."""
 
 MOST_OF_ONE_WARP = 64
 """Rows of J up to which one warp of 32 threads works on a row: no threads wait for others. Four do
@@ -222,8 +226,9 @@ def _hessian_at(given: Constraints, a: Array) -> Array:
 def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Array]:
     given = repeated(has_rows, given)
     rows, nv = given.J.shape[-2:]
-    most = MOST_ROWS if given.cones is None else MOST_IN_CONES
-    fits = nv <= MOST_DOFS and rows <= most and given.M.dtype == np.float32
+    most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
+    most = most if given.cones is None else min(most, MOST_IN_CONES)
+    fits = rows <= most and given.M.dtype == np.float32
     plain = jax.vmap(_plain)
     if not (on_gpu() and fits and of_one_precision(jax.tree.leaves(given))):
         return plain(given)
