@@ -115,11 +115,13 @@ class Polish:
 
     Attributes:
         tolerance: on the residual; 1e-4 is what float32 can reach, 1e-8 what float64 can.
-        iterations: at most so many; 0: no polish.
+        iterations: at most so many in an attempt; 0: no polish.
+        patience: so many times as many while no chain at the best cost has settled.
     """
 
     tolerance: ArrayLike = 1e-4
     iterations: int = 200
+    patience: int = 5
 
 
 @register_dataclass

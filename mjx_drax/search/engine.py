@@ -9,6 +9,7 @@ done into chunks of one size, which one compilation serves and which fit into me
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -128,7 +129,7 @@ class Stage:
     Attributes:
         attempt: the one that is under way, from 0.
         heated: whether it has noise.
-        finishing: whether it goes on with what is kept instead; see `_next_attempt`.
+        finishing: how often it went on with what is kept instead; see `_begin_to_finish`.
         cost_scale: of each problem, (N,).
         floor: what costs of each problem are measured from, (N,); see `sizes`.
         todo: problems of this attempt.
@@ -151,7 +152,7 @@ class Stage:
 
     attempt: int
     heated: bool
-    finishing: bool
+    finishing: int
     cost_scale: np.ndarray
     floor: np.ndarray
     todo: np.ndarray
@@ -213,6 +214,7 @@ class Search:
         recorder: of a single problem's knots.
         progress: called with (iterations done, of how many, diagnostics) for a single problem.
         chunk_done: called with (problems done, of how many) after every chunk.
+        seconds: after which a single problem's search is interrupted, at a report.
     """
 
     family: Family
@@ -226,6 +228,7 @@ class Search:
     recorder: Recorder | None = None
     progress: Progress | None = None
     chunk_done: Callable[[int, int], None] | None = None
+    seconds: float = math.inf
 
     stage: Stage = field(init=False)
     flow: Langevin = field(init=False)
@@ -308,7 +311,7 @@ class Search:
         self.stage = Stage(
             attempt=0,
             heated=False,
-            finishing=False,
+            finishing=0,
             cost_scale=scale,
             floor=np.zeros(family.count),
             todo=everyone,
@@ -425,7 +428,8 @@ class Search:
         assert kept is not None
         assert settings.enough is not None
         if stage.finishing:
-            return False
+            assert self.polish is not None
+            return stage.finishing < self.polish.patience and self._begin_to_finish()
         bar = self._done_up_to(everyone)
         unfinished = (self._worth(kept, everyone) > bar).sum(axis=1)
         todo = np.flatnonzero(unfinished > (1.0 - settings.enough) * self.chains)
@@ -452,18 +456,19 @@ class Search:
             return False
         assert kept is not None
         unfinished = self._unfinished(kept)
-        if not unfinished.sum() > STRAGGLERS * self.chains:
+        if not unfinished.any():
             return False
-        least = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
+        done = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
         self.stage = replace(
             stage,
-            finishing=True,
+            finishing=stage.finishing + 1,
             begun=True,
             place=0,
             owners=np.arange(self.chains),
             now=kept,
             before=kept.worth,
-            step=self.flow.iterations + max(least, 1),  # the first only brings chains inside
+            # the first only brings chains inside
+            step=self.flow.iterations + max(done % (self.settings.after - 1), 1),
             began=(*stage.began, (stage.done, stage.done)),
         )
         if self.recorder is not None:
@@ -487,9 +492,11 @@ class Search:
         return self.settings.enough > 1.0
 
     def _unfinished(self, chains: Chains) -> np.ndarray:
-        """Which chains are being polished, (rows,); when finishing, if they have iterations left.
+        """Which chains the finish polishes, (rows,): those that move and have iterations left.
 
-        They need one more in the end, which measures their residual.
+        They need one more in the end, which measures their residual. For a share `STRAGGLERS` it
+        does not wait. While no chain at the best cost has settled, or none is sound, those there
+        get more.
         """
         polish, state = self.polish, chains.state
         assert polish is not None
@@ -497,7 +504,14 @@ class Search:
             np.asarray(gathered(a, self.mesh))
             for a in (state.polish.iterations, state.polish.active, state.alive)
         )
-        return active & alive & (done < polish.iterations - 1)
+        moves, most = active & alive, polish.iterations - 1
+        left = moves & (done < most)
+        if left.sum() > STRAGGLERS * self.chains:
+            return left
+        costs, size = chains.worth - self.stage.floor[0], np.asarray(chains.info.size)
+        bar = done_up_to(costs, size, CHEAPER, self.stage.cost_scale[0])
+        near = costs <= bar if chains.sound.any() else moves
+        return moves & near & (done < polish.patience * most) & (moves | ~near).all()
 
     def _worth(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
         """Costs of those problems' chains, from their floors, (len(indices), chains)."""
@@ -674,7 +688,7 @@ class Search:
         if not (polished and self.family.alone and stage.step % usual == 0):
             return True
         if stage.finishing:
-            return bool(self._unfinished(now).sum() > STRAGGLERS * self.chains)
+            return bool(self._unfinished(now).any())
         active = np.asarray(gathered(now.state.polish.active & now.state.alive, self.mesh))
         if stage.attempt + 1 < settings.attempts or (self._ends_early and stage.attempt > 0):
             bar, floor = self._done_up_to(self.indices, now).item(), stage.floor[0]
@@ -820,6 +834,8 @@ class Search:
         if self.progress is not None:
             begun = done - stage.step + self.flow.iterations + self.settings.after
             self.progress(done, max(begun, done), stage.now.info)
+        if time.perf_counter() - self.clock > self.seconds:
+            raise KeyboardInterrupt
 
     def _record(self) -> None:
         """Record knots too, if asked for."""

@@ -195,6 +195,7 @@ class Restarts:
         if self.polish is not None:
             require_positive("polish.tolerance", self.polish.tolerance, "a number, such as 1e-4")
             require_whole("polish.iterations", self.polish.iterations, 0)
+            require_whole("polish.patience", self.polish.patience)
         if not isinstance(self.rollouts, Rollouts | None):
             raise DraxError(f"rollouts is {shown(self.rollouts)}: give Rollouts() or None.")
         for name in ("first", "rounds", "iterations") if self.rollouts else ():
@@ -262,7 +263,7 @@ def _polished(
         given["tolerance"] = float(tolerance)
     if iterations is not None:
         require_whole("max_iterations", iterations)
-        given["iterations"] = int(iterations)
+        given |= {"iterations": int(iterations), "patience": 1}
     if not given:
         return settings
     polish = settings.polish

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_drax.base.errors import DraxError
+from mjx_drax.base.errors import DraxError, require_positive
 from mjx_drax.kernels.compilation import keep_programs, said_plainly
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem, checked
@@ -43,6 +44,7 @@ def solve(
     tolerances: Tolerances | None = None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
+    max_seconds: float | None = None,
     precision: int | None = None,
 ) -> Solution:
     """Run `chains` Langevin chains and replay what they found.
@@ -76,7 +78,10 @@ def solve(
         tolerance: residual below which a chain is optimal and stops; by default 1e-4, and 1e-8 in
             float64. It is for the optimality of plans, and `tolerances` for violations of replays.
         max_iterations: most iterations of the polish that brings it there, in an attempt; by
-            default 200. Given either, chains are polished where by default they are not.
+            default 200, and where then no chain at the best cost has settled, up to 1,000 in the
+            end. Given either, chains are polished where by default they are not.
+        max_seconds: after which the solve ends as by Ctrl-C, at the next report [s]; the time to
+            compile does not count.
         precision: 64: in float64, whatever JAX is set to; see `Problem.in_float64` for what that
             asks of the problem. 32: in float32. None: in the precision of the problem.
 
@@ -98,6 +103,8 @@ def solve(
         tolerances = as_tolerances(tolerances)
         tolerances.of(problem)  # refuses those of another size
         settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
+        if max_seconds is not None:
+            require_positive("max_seconds", max_seconds)
         if record is not None and not isinstance(record, Recorder):
             record = Recorder(record)
         given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess
@@ -110,6 +117,7 @@ def solve(
             guess=given,
             checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
             recorder=record,
+            seconds=math.inf if max_seconds is None else max_seconds,
         )
         with report as search.progress, said_plainly(f"the solve of {problem.name}"):
             found = search.run()

@@ -52,6 +52,7 @@ SETTINGS = [
      "tolerances are 1e-06", "tolerance, singular"),
     ("max_iterations-half", lambda at: solve(at.point, max_iterations=0.5),
      "max_iterations is 0.5"),
+    ("max_seconds-0", lambda at: solve(at.point, max_seconds=0), "max_seconds is 0"),
     ("max_iterations-0", lambda at: solve(at.point, max_iterations=0), "max_iterations is 0"),
     ("max_iterations-none-there",
      lambda at: solve(at.point, solver=Restarts(polish=Polish(iterations=0)), max_iterations=9),
