@@ -8,6 +8,7 @@ from html import escape
 
 import numpy as np
 
+from mjx_drax.solution.names import control_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Results
 from mjx_drax.solution.violations import GOAL, TRACKING, words
@@ -25,6 +26,9 @@ INTERRUPTED = "interrupted    the solve was ended before its time; this is the b
 
 ALIKE = 0.01
 """Costs that differ by less than this share are the same."""
+
+ON_BOUND = 0.01
+"""Share of its range within which an entry is on an end of it."""
 
 LABEL = 15
 """Characters of a line that name what it is about."""
@@ -141,6 +145,24 @@ def _only(solution: Results) -> str:
     )
 
 
+def _most_bounded(solution: Results, chain: int) -> str:
+    """Which entry of a plan lies on an end of its range most often, if at a tenth of the knots."""
+    dynamics, box = solution.problem.dynamics, solution.problem.bounds
+    knots, found = solution.trajectories, []
+    for names, z, lower, upper in (
+        (control_names(dynamics), knots.u[chain], box.u_lower, box.u_upper),
+        (state_names(dynamics), knots.x[chain], box.x_lower, box.x_upper),
+    ):
+        low, high = (np.broadcast_to(side, z.shape) for side in (lower, upper))
+        boxed = np.isfinite(low) & np.isfinite(high)
+        margin = ON_BOUND * np.where(boxed, high - low, 0.0)
+        on = boxed & ((z <= low + margin) | (z >= high - margin))
+        found += list(zip(on.sum(axis=0).tolist(), names, strict=True))
+    times, name = max(found, key=lambda entry: entry[0])
+    K = solution.problem.horizon
+    return f", and {name} is on a bound at {times} of {K} knots" if times >= 0.1 * K else ""
+
+
 def _advice(solution: Results) -> str:
     """What to try when no chain could be certified; the shell has the same names."""
     if solution.interrupted:
@@ -149,9 +171,13 @@ def _advice(solution: Results) -> str:
     if where is not None:
         unfinished = solution.polished[solution.best_chain] == UNFINISHED
         more = ", more max_iterations" if unfinished else ""
+        longer = "a longer horizon"
+        if getattr(solution.problem.dynamics, "phases", ()):
+            longer = "longer durations"
         return (
-            f"no plan is feasible; the best {where.told(solution.problem)}. Try more iterations"
-            f"{more}, or a longer horizon."
+            f"no plan is feasible; the best {where.told(solution.problem)}"
+            f"{_most_bounded(solution, solution.best_chain)}. Try more iterations{more}, or "
+            f"{longer}."
         )
     unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])
     if unplanned is not None:

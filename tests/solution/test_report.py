@@ -38,6 +38,17 @@ def test_a_notebook_shows_the_report_as_a_table_and_no_markup_of_others():
     assert colors[0] != colors[1]
 
 
+def test_an_infeasible_plan_says_which_bound_it_lies_on():
+    made = made_up(point(u_bounds=([-1.0, -2.0], [1.0, 2.0])))
+    u = made.trajectories.u.copy()
+    far = replace(made, max_defect=np.ones(2, np.float32))
+    for value, said in ((1.5, ""), (1.995, ", and u1 is on a bound at 4 of 10 knots")):
+        u[:, 3:7, 1] = value
+        advice = str(replace(far, trajectories=replace(made.trajectories, u=u))).splitlines()[-1]
+        assert f"{said}. Try more iterations, or a longer horizon." in advice
+        assert ("on a bound" in advice) == bool(said)
+
+
 def test_worst_names_entry_and_knot_of_plan_and_replay():
     problem = point(
         inequality=lambda x, u: jnp.stack([x[0] - 1.0, 2.0 * u[1] - 0.1]),
