@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -58,10 +59,12 @@ def start() -> str:
     return f"{jax.devices()[0].device_kind}, jax {jax.__version__}\n\n{HEADER}"
 
 
-def answers(problem: Problem, chains: int, seeds: int) -> Iterator[tuple[str, Solution]]:
-    """The row and the solution of each seed."""
+def answers(
+    problem: Problem, chains: int, seeds: int, **settings: Any
+) -> Iterator[tuple[str, Solution]]:
+    """The row and the solution of each seed; `settings` are those of `solve`."""
     for seed in range(seeds):
-        solution = solve(problem, chains=chains, seed=seed, progress=False)
+        solution = solve(problem, chains=chains, seed=seed, progress=False, **settings)
         yield line(solution), solution
 
 

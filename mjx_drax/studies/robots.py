@@ -1,6 +1,7 @@
 """Small tasks for robots of other packages, from their files as they are shipped.
 
     python -m mjx_drax.studies.robots [NAME ...] [--path DIR] [--chains N] [--seeds N]
+                                      [--attempts N] [--seconds S]
 
 A file is sought by its path inside of its package (`TASKS`), as in hydrax/models/walker/scene.xml:
 below DIR, or where the package is installed. Nothing of a package is imported. The table is that
@@ -32,6 +33,7 @@ from mjx_drax.physics.mjcf import from_mjcf
 from mjx_drax.physics.motors import Actuators, add_motors
 from mjx_drax.physics.source import load
 from mjx_drax.problem.problem import Problem
+from mjx_drax.search.restarts import Restarts
 from mjx_drax.studies.answers import answers, start
 
 
@@ -315,6 +317,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--path", type=Path, metavar="DIR", help="where the packages' files lie")
     parser.add_argument("--chains", type=int, default=16)
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="solves of each task")
+    parser.add_argument("--attempts", type=int, default=5, metavar="N", help="default 5")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end each solve after so long")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in TASKS]
     if unknown:
@@ -322,6 +326,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     print(start(), flush=True)
     certified, refused = True, []
+    settings = {"solver": Restarts(attempts=options.attempts), "max_seconds": options.seconds}
     for name in options.names or TASKS:
         inside, make = TASKS[name]
         try:
@@ -329,7 +334,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except DraxError as error:
             refused.append(f"{name}: {error}")
             continue
-        for row, solution in answers(problem, options.chains, options.seeds):
+        for row, solution in answers(problem, options.chains, options.seeds, **settings):
             print(row, flush=True)
             certified = certified and solution.certified
     print("\n".join(["", *refused]))
