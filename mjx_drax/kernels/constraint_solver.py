@@ -55,9 +55,8 @@ DIGITS = 32.0
 MOST_ROWS, MOST_IN_CONES = ((32, 512), (64, 128)), 64
 """Most rows of J for which there is a kernel, up to so many columns; and those with elliptic cones.
 
-Where there are more, arrays are as fast or faster: 72 rows of Spot's cones, in 8,960 states, take
-90 ms in a kernel and 65 ms as arrays. 275 rows of a hand's contacts, in 1,600 states, take 26 ms in
-a kernel and 70 ms as arrays (one H100 with other work)."""
+On an H100 with other work, 275 rows of a hand's contacts, in 1,600 states, take 26 ms in the kernel
+and 70 ms as arrays; 72 rows of Spot's cones, in 8,960 states, 90 and 65 ms."""
 
 MOST_OF_ONE_WARP = 64
 """Rows of J up to which one warp of 32 threads works on a row: no threads wait for others. Four do
