@@ -399,7 +399,10 @@ def optimality(residual: float, tolerance: float, ending: str) -> str:
         return "residual not known"
     if residual < tolerance:
         return f"residual {residual:.1e}, below {tolerance:g}"
-    how = {STALLED: ": the polish stalled", UNFINISHED: ": the polish is unfinished (max_iterations)"}
+    how = {
+        STALLED: ": the polish stalled",
+        UNFINISHED: ": the polish is unfinished (max_iterations)",
+    }
     return f"residual {residual:.1e}, above {tolerance:g}{how.get(ending, '')}"
 
 

@@ -302,7 +302,8 @@ def test_optimal_is_certified_with_a_small_residual():
     others = replace(made, residual=np.full(4, 1e-2))
     assert not others.optimal
     assert others.verdict == "CERTIFIED, not known to be optimal"
-    assert others.optimality == "residual 1.0e-02, above 0.0001: the polish is unfinished (max_iterations)"
+    unfinished = "residual 1.0e-02, above 0.0001: the polish is unfinished (max_iterations)"
+    assert others.optimality == unfinished
     others = replace(others, stalled=np.array([True, True, False, False]))
     stalled = "residual 1.0e-02, above 0.0001: the polish stalled; precision=64 may get further"
     assert others.optimality == stalled
