@@ -116,7 +116,8 @@ class Polish:
     Attributes:
         tolerance: on the residual; 1e-4 is what float32 can reach, 1e-8 what float64 can.
         iterations: at most so many in an attempt; 0: no polish.
-        patience: so many times as many while no chain at the best cost has settled.
+        patience: of a single problem, after the last attempt, so many times as many, while no
+            chain at the best cost has settled.
     """
 
     tolerance: ArrayLike = 1e-4
