@@ -153,8 +153,12 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     from mjx_drax.solution.solve import solve
     from mjx_drax.view.video import check as require_drawing
 
-    polish = {"tolerance": options.residual, "max_iterations": options.max_iterations}
-    settled(problem, chains, options.seed, solver, **polish)  # refuses what cannot work
+    ends = {
+        "tolerance": options.residual,
+        "max_iterations": options.max_iterations,
+        "max_seconds": options.max_seconds,
+    }
+    settled(problem, chains, options.seed, solver, **ends)  # refuses what cannot work
     tolerances = _tolerances(options.tolerances)
     tolerances.of(problem)
     wanted = export.chosen(options)
@@ -187,8 +191,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
         record=record,
         checkpoint=options.checkpoint,
         tolerances=tolerances,
-        **polish,
-        max_seconds=options.max_seconds,
+        **ends,
         precision=options.precision,
     )
     results.save(solution, folder)

@@ -835,7 +835,7 @@ class Search:
             begun = done - stage.step + self.flow.iterations + self.settings.after
             self.progress(done, max(begun, done), stage.now.info)
         if time.perf_counter() - self.clock > self.seconds:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt  # which keeps what there is
 
     def _record(self) -> None:
         """Record knots too, if asked for."""

@@ -225,6 +225,7 @@ def settled(
     solver: Langevin | Restarts | None,
     tolerance: float | None = None,
     max_iterations: int | None = None,
+    max_seconds: float | None = None,
 ) -> Restarts:
     """The settings of a solve, checked, with a value for each that depends on the problem.
 
@@ -232,14 +233,17 @@ def settled(
         problem: what is solved.
         chains, seed, solver: as in `solve`.
         tolerance, max_iterations: of the polish; None: as the solver and the problem have it.
+        max_seconds: as in `solve`; it is just checked.
 
     Raises:
-        DraxError: a number of chains, seed or setting that cannot work.
+        DraxError: a number of chains, of seconds, seed or setting that cannot work.
     """
     require_whole("chains", chains)
     require_whole("seed", seed, 0)
     if seed >= 2**32:
         raise DraxError(f"seed is {seed!r}: give a whole number from 0 to 2**32 - 1.")
+    if max_seconds is not None:
+        require_positive("max_seconds", max_seconds)
     settings = as_restarts(solver)
     settings.check(problem)
     settings = _polished(settings, problem, tolerance, max_iterations).for_problem(problem)

@@ -145,10 +145,13 @@ def _only(solution: Results) -> str:
     )
 
 
-def _most_bounded(solution: Results, chain: int) -> str:
-    """Which entry of a plan lies on an end of its range most often, if at a tenth of the knots."""
+def _most_bounded(solution: Results) -> str:
+    """Which entry of the best plan is at an end of its range most often, in a tenth of the knots.
+
+    Nothing if none is in so many.
+    """
     dynamics, box = solution.problem.dynamics, solution.problem.bounds
-    knots, found = solution.trajectories, []
+    knots, chain, found = solution.trajectories, solution.best_chain, []
     for names, z, lower, upper in (
         (control_names(dynamics), knots.u[chain], box.u_lower, box.u_upper),
         (state_names(dynamics), knots.x[chain], box.x_lower, box.x_upper),
@@ -171,13 +174,11 @@ def _advice(solution: Results) -> str:
     if where is not None:
         unfinished = solution.polished[solution.best_chain] == UNFINISHED
         more = ", more max_iterations" if unfinished else ""
-        longer = "a longer horizon"
-        if getattr(solution.problem.dynamics, "phases", ()):
-            longer = "longer durations"
+        free = getattr(solution.problem.dynamics, "phases", ())
+        longer = "longer durations" if free else "a longer horizon"
         return (
             f"no plan is feasible; the best {where.told(solution.problem)}"
-            f"{_most_bounded(solution, solution.best_chain)}. Try more iterations{more}, or "
-            f"{longer}."
+            f"{_most_bounded(solution)}. Try more iterations{more}, or {longer}."
         )
     unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])
     if unplanned is not None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_drax.base.errors import DraxError, require_positive
+from mjx_drax.base.errors import DraxError
 from mjx_drax.kernels.compilation import keep_programs, said_plainly
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem, checked
@@ -102,9 +102,7 @@ def solve(
     with problem.arithmetic():
         tolerances = as_tolerances(tolerances)
         tolerances.of(problem)  # refuses those of another size
-        settings = settled(problem, chains, seed, solver, tolerance, max_iterations)
-        if max_seconds is not None:
-            require_positive("max_seconds", max_seconds)
+        settings = settled(problem, chains, seed, solver, tolerance, max_iterations, max_seconds)
         if record is not None and not isinstance(record, Recorder):
             record = Recorder(record)
         given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess

@@ -67,6 +67,7 @@ COMMANDS = [
     ("residual-0", task("--residual", "0"), "tolerance is 0.0"),
     ("residual-no-polish", task("--residual", "1e-3", "--set", "polish=Polish(iterations=0)"),
      "tolerance is 0.001", "leave tolerance out"),
+    ("max-seconds-0", task("--max-seconds", "0"), "max_seconds is 0.0"),
     ("max-iterations", task("--max-iterations", "0"), "--max-iterations", "whole number"),
     ("precision", task("--precision", "16"), "--precision", "16", "32", "64"),
     ("film-suffix", lambda at: ["solve", "bug_trap", "--film", "a.avi", "--out", str(at.folder)],

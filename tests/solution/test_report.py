@@ -49,6 +49,13 @@ def test_an_infeasible_plan_says_which_bound_it_lies_on():
         assert ("on a bound" in advice) == bool(said)
 
 
+def test_an_infeasible_plan_of_free_duration_is_to_take_longer():
+    free = {"horizon": (0.5, 1.0), "knots": 10, "dt": None}
+    made = made_up(point(f=lambda x, u, knot: x + knot.dt * u, **free))
+    advice = str(replace(made, max_defect=np.ones(2, np.float32))).splitlines()[-1]
+    assert advice.endswith("or longer durations.")
+
+
 def test_worst_names_entry_and_knot_of_plan_and_replay():
     problem = point(
         inequality=lambda x, u: jnp.stack([x[0] - 1.0, 2.0 * u[1] - 0.1]),
