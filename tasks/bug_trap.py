@@ -1,7 +1,7 @@
 """Unicycle in the paper's bug trap: the way to the goal leads back out of a U of obstacles.
 
-K = 119 by default. At the paper's 4.9 s (K = 49) staying inside is optimal: the way out is about
-as long as the robot can drive in that time.
+K = 119 by default. The paper states no horizon; at the 4.9 s of its authors' prototype (K = 49)
+staying inside is optimal: the way out is about as long as the robot can drive in that time.
 """
 
 from __future__ import annotations

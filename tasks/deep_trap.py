@@ -1,6 +1,6 @@
 """Unicycle in a deeper trap: two metres of walls on both sides, so the way out costs far more.
 
-IPOPT stays inside or ploughs through the wall (docs/benchmarks.md); K = 119 leaves time to get out.
+IPOPT stays inside or ploughs through the wall (docs/compared.md); K = 119 leaves time to get out.
 """
 
 from __future__ import annotations
