@@ -87,6 +87,8 @@ def test_bug_trap_gives_every_method_the_same_budget():
     assert {budgets[name] for name in set(budgets) - long} == {30}
     assert numbers["settings"]["gradient descent"].noise.start == 0.0
     assert figure_is_drawn(figure)
+    titles = [axes.get_title(loc="left").split("\n")[0] for axes in figure.axes]
+    assert titles == ["(a) gradient descent", "(b) BFGS, full matrix", "(c) paper's flow"]
 
 
 @pytest.mark.slow

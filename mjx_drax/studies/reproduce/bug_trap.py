@@ -47,7 +47,8 @@ def make(
 
     The budget is by default that of the preconditioned settings. First-order methods have rows for
     `longer` times as much too, because one of their iterations costs less; these are drawn, as the
-    paper draws them. With `matrix` so has BFGS with a full matrix, which takes the longest.
+    paper draws them. With `matrix` so has BFGS with a full matrix, which takes the longest; then it
+    is drawn in the place of L-BFGS, as in the paper.
     """
     problem = tasks.load("bug_trap").make()
     budget = iterations or settings.budget_of(settings.TRAP)
@@ -59,8 +60,10 @@ def make(
         tell(f"bug-trap, {count}: {name}, {settings.budget_of(solver):,} iterations")
         solutions[name] = solve(problem, chains, solver=solver, guess=start)
     rows = {name: solve_row(name, solution) for name, solution in solutions.items()}
-    drawn = {name: f"{name}, {longer}×" for name in FIRST_ORDER}
-    figure = _draw({name: (solutions[long], rows[long]) for name, long in drawn.items()})
+    drawn = FIRST_ORDER[0], MATRIX if matrix else FIRST_ORDER[1], FIRST_ORDER[2]
+    titles = {FIRST_ORDER[1]: "L-BFGS (in the paper: BFGS)"}
+    found = {titles.get(name, name): f"{name}, {longer}×" for name in drawn}
+    figure = _draw({name: (solutions[long], rows[long]) for name, long in found.items()})
     return {"rows": list(rows.values()), "budget": budget, "settings": solvers}, figure
 
 
@@ -94,7 +97,7 @@ def _draw(found: dict[str, tuple[Solution, Numbers]]) -> Figure:
     panels[0].plot([], [], color=BLACK, lw=2.2, label="the best")
     panels[0].set_ylabel("y [m]", fontsize=8)
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=7.5)
     horizon, chains = solution.problem.horizon, solution.chains
     figure.suptitle(f"Bug trap, K = {horizon}, {chains} chains from the same knots", fontsize=10)
     return figure
@@ -119,8 +122,10 @@ def _draw_paths(axes: Axes, solution: Solution) -> None:
     best = paths[solution.best_chain]
     if feasible.any():
         axes.plot(best[:, 0], best[:, 1], color=BLACK, lw=2.2, zorder=4)
-    axes.plot(*paths[0, 0, :2], "s", ms=6, color=BLACK, mec="white", zorder=5)
-    axes.plot(*task.GOAL, "*", ms=15, color=GREEN, mec="white", zorder=5, label="goal")
+    start = paths[0, 0, :2]
+    marked: dict[str, Any] = {"ls": "", "mec": "white", "zorder": 5}
+    axes.plot(*start, "s", ms=6, color=BLACK, label="start", **marked)
+    axes.plot(*task.GOAL, "*", ms=15, color=GREEN, label="goal", **marked)
     axes.set(xlim=(-3, 3), ylim=(-3, 3), aspect="equal")
     axes.set_xlabel("x [m]", fontsize=8)
     axes.tick_params(labelsize=7)

@@ -155,14 +155,15 @@ def make(
             energies[f"{optimum.rho:g}"] = _energies(
                 functions, optimum, chains, iterations or 4000, steps
             )
-    figure = new_figure(9.0, 3.6)
+    figure = new_figure(10.2, 3.6)
     left, right = figure.subplots(1, 2)
     weights = [row["rho"] for row in rows]
     for name, color in zip(list(rows[0])[2:4], CURVES, strict=False):
-        left.loglog(weights, [row[name] for row in rows], "o-", color=color, label=name)
+        label = name.replace("mu", "μ")
+        left.loglog(weights, [row[name] for row in rows], "o-", color=color, label=label)
     label_axes(left, "barrier weight ρ", "penalty μ")
     left.set_title("pendulum: where theorem 2 holds", loc="left", fontsize=9)
-    left.legend(fontsize=7)
+    left.legend(fontsize=7, loc="upper left")
     drawn = energies[f"{barriers[0]:g}"]
     for (mu, curve), color in zip(drawn.items(), CURVES, strict=False):
         for name, style in (("the proof's", "--"), ("with μ|h|²", "-")):
@@ -172,7 +173,7 @@ def make(
     right.plot([], [], "-", color=BLACK, label="|v|²/2 + μ |h|²")
     label_axes(right, "iteration", "energy, relative to the first")
     right.set_title(f"energy from near the optimum, ρ = {barriers[0]:g}", loc="left", fontsize=9)
-    right.legend(fontsize=7)
+    right.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     rises = [
         {
             "rho": float(rho),
