@@ -12,7 +12,10 @@ import os
 import sys
 from collections.abc import Sequence
 
+from typing import NoReturn
+
 from mjx_drax.base.errors import DraxError
+from mjx_drax.base.version import __version__
 from mjx_drax.cli import benchmark, check, export, list_tasks, mpc, reproduce, solve, view
 
 COMMANDS = {
@@ -49,13 +52,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 141
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="mjx-drax",
         description="Finds motions for MuJoCo models: give a model and a cost, get a trajectory "
         "that MuJoCo can replay, and a video of it.",
         epilog="First try: mjx-drax solve cartpole. Help on a command: mjx-drax COMMAND --help.",
     )
+    parser.add_argument("--version", action="version", version=f"mjx-drax {__version__}")
     parser.set_defaults(run=None)
     commands = parser.add_subparsers(metavar="COMMAND")
     for name, command in COMMANDS.items():

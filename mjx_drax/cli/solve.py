@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--side-by-side",
         action="store_true",
-        help="also film plan and replay beside each other: comparison.mp4",
+        help="also film plan and replay beside each other, of a model: comparison.mp4",
     )
     add(
         "--live",
@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         const=8080,
         metavar="PORT",
         help="show the knots in a browser while the solve runs, then the answer until Ctrl-C; "
-        "default port 8080",
+        'default port 8080; needs pip install "mjx-drax[view]"',
     )
     export.add_flags(parser)
     add(
@@ -129,7 +129,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also print cost, max|h| and residual by iteration, which plot.png draws, and the "
         "worst violations by name and knot",
     )
-    add("--quiet", action="store_true", help="print nothing but errors")
+    add("--quiet", action="store_true", help="no report and no bar; errors, and what --json prints")
     add("--json", action="store_true", help="print result.json, and nothing else, to stdout")
 
 
@@ -148,6 +148,7 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     """The same, in the precision that JAX has now; `stack` closes what it opens."""
     problem, solver, chains, draw = _asked(options)
+    from mjx_drax.physics.dynamics import mujoco_model
     from mjx_drax.search.restarts import settled
     from mjx_drax.solution import save as results
     from mjx_drax.solution.solve import solve
@@ -167,9 +168,13 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = pictures.look_of(options)
+    if options.side_by_side and mujoco_model(problem.dynamics) is None:
+        raise DraxError(
+            f"{problem.name} has no MuJoCo model: --side-by-side films models only. Leave it out."
+        )
     if look or options.film is not None or options.side_by_side:
         seen = pictures.without_caption(look)
-        require_drawing(problem, draw=None if options.side_by_side else draw, **seen)
+        require_drawing(problem, draw=draw, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)
     tell = say_nothing if options.quiet or options.json else say
     record: Any = 1 if film else None
@@ -219,7 +224,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     older = [name for name in names if name not in written and (folder / name).exists()]
     if older:
         tell(f"there from an earlier solve: {', '.join(older)}")
-    if options.json and not options.quiet:
+    if options.json:
         print((folder / results.SUMMARY).read_text(encoding="utf-8"), end="", flush=True)
     if options.live is not None:
         tell("the page shows the answer; Ctrl-C ends it")

@@ -2,3 +2,11 @@
 
 Read schedules, model, bounds, metrics, riccati, gauss_newton, descent, langevin.
 """
+
+import pkgutil
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, submodules=[module.name for module in pkgutil.iter_modules(__path__)]
+)

@@ -1,5 +1,9 @@
 """Helpers to pose a problem: terms of costs, distances, obstacles, initial guesses."""
 
+import pkgutil
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["guesses", "obstacles"])
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, submodules=[module.name for module in pkgutil.iter_modules(__path__)]
+)

@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
-from mjx_drax.base.errors import DraxError
+from mjx_drax.base.errors import DraxError, require_positive, require_whole
 from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjcf import from_mjcf
@@ -323,6 +323,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in options.names if name not in TASKS]
     if unknown:
         print(f"there is no task {', '.join(unknown)}: use {', '.join(TASKS)}.", file=sys.stderr)
+        return 2
+    try:
+        for count in ("chains", "seeds", "attempts"):
+            require_whole(f"--{count}", getattr(options, count))
+        if options.seconds is not None:
+            require_positive("--seconds", options.seconds)
+    except DraxError as error:
+        print(error, file=sys.stderr)
         return 2
     print(start(), flush=True)
     certified, refused = True, []

@@ -12,6 +12,9 @@ PROGRAM = """
 import importlib, sys, mjx_drax
 assert "mjx_drax.view" not in sys.modules
 assert mjx_drax.view is sys.modules["mjx_drax.view"]
+assert "mjx_drax.view.plotting" not in sys.modules
+assert mjx_drax.view.plotting is sys.modules["mjx_drax.view.plotting"]
+assert not hasattr(mjx_drax.view, "nothing")
 assert not hasattr(mjx_drax, "nothing")
 assert not hasattr(mjx_drax, "__main__")
 from mjx_drax import models, tasks

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from builders import At
 
-from mjx_drax import DraxError, Geometric, Solution, from_mjcf, tasks
+from mjx_drax import DraxError, Geometric, Solution, __version__, from_mjcf, tasks
 from mjx_drax.cli import cost_file, main, mpc, pictures
 from mjx_drax.control import trials
 from mjx_drax.physics.report import text
@@ -94,6 +94,13 @@ def test_a_reader_may_stop_reading():
 def test_without_a_command_the_help_is_printed(capsys):
     assert main([]) == 0
     assert "usage: mjx-drax" in capsys.readouterr().out
+
+
+def test_the_version_is_printed(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"mjx-drax {__version__}\n"
 
 
 def test_an_unknown_task_is_refused_before_anything_heavy_is_imported():
@@ -246,10 +253,11 @@ def test_the_log_is_printed(slider, tmp_path, capsys, monkeypatch):
 
 def test_json_is_all_that_is_printed(slider, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: slider)
-    assert main(f"solve pendulum --no-video --json --out {tmp_path}".split()) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["task"] == "slider"
-    assert printed == json.loads((tmp_path / "result.json").read_text())
+    for quiet in ("", " --quiet"):
+        assert main(f"solve pendulum --no-video --json --out {tmp_path}{quiet}".split()) == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed["task"] == "slider"
+        assert printed == json.loads((tmp_path / "result.json").read_text())
 
 
 def test_export_writes_what_is_asked_for(slider, tmp_path, capsys):
