@@ -11,7 +11,6 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-
 from typing import NoReturn
 
 from mjx_drax.base.errors import DraxError

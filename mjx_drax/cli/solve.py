@@ -109,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=at_least_1,
         metavar="N",
         help="most iterations of the polish, Newton steps at the end, in an attempt; default 200, "
-        "and up to 1,000 in the end while no chain at the best cost has settled",
+        "and up to 1,000 in the end, until a chain at the best cost has converged or stalled",
     )
     add(
         "--max-seconds",

@@ -159,8 +159,8 @@ def make(
     left, right = figure.subplots(1, 2)
     weights = [row["rho"] for row in rows]
     for name, color in zip(list(rows[0])[2:4], CURVES, strict=False):
-        label = name.replace("mu", "μ")
-        left.loglog(weights, [row[name] for row in rows], "o-", color=color, label=label)
+        words = name.replace("mu", "μ")
+        left.loglog(weights, [row[name] for row in rows], "o-", color=color, label=words)
     label_axes(left, "barrier weight ρ", "penalty μ")
     left.set_title("pendulum: where theorem 2 holds", loc="left", fontsize=9)
     left.legend(fontsize=7, loc="upper left")
