@@ -52,23 +52,23 @@ ITERATIONS, SIZES = 20, 16
 DIGITS = 32.0
 """A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
-MOST_ROWS, MOST_IN_CONES = ((32, 512), (64, 128)), 64
-"""Most rows of J for which there is a kernel, up to so many columns; and those with elliptic cones.
+MOST_ROWS = ((32, 512), (64, 128))
+"""Most rows of J for which there is a kernel, up to so many columns.
 
-On an H100 with other work, 275 rows of a hand's contacts, in 1,600 states, take 26 ms in the kernel
-and 70 ms as arrays; 72 rows of Spot's cones, in 8,960 states, 90 and 65 ms."""
+On an H100, 275 rows of a hand's contacts, in 1,600 states, take 26 ms in the kernel and 70 ms as
+arrays; 72 rows of Spot's elliptic cones, in 8,960 states, 5.6 and 21 ms."""
 
 MOST_OF_ONE_WARP = 64
-"""Rows of J up to which one warp of 32 threads works on a row: no threads wait for others. Four do
-for more, and with elliptic cones, for which the registers of one are too few."""
+"""Rows of J, in tiles, up to which one warp of 32 threads works on a state: none waits for others.
+Four do for more, for which the registers of one are too few."""
 
 
 class Constraints(NamedTuple):
     """M (nv, nv), J (m, nv), D and aref (m,), a0 (nv,).
 
     s'(y) = D clip(y, lower, upper), all (m,). What holds to both sides has no bounds; contacts and
-    limits, which only push, have upper = 0; dry friction has the y at which it slides. Rows of
-    elliptic friction cones have D = 0.
+    limits, which only push, have upper = 0; dry friction has the y at which it slides. Elliptic
+    friction cones have rows of their own.
     """
 
     M: Array
@@ -78,7 +78,11 @@ class Constraints(NamedTuple):
     lower: Array
     upper: Array
     a0: Array
-    cones: elliptic.Cones | None = None
+    cones: tuple[elliptic.Cones, ...] = ()
+
+
+Rows = tuple[Array, ...]
+"""Of the rows of `law`, (m,), then of each of the cones, (d, c)."""
 
 
 def law(given: Constraints, y: Array) -> tuple[Array, Array]:
@@ -95,55 +99,67 @@ def changes(given: Constraints, y: Array, h: Array) -> tuple[Array, Array]:
     return given.D * moved * (later - there + 0.5 * moved), given.D * moved
 
 
-def forces(given: Constraints, y: Array) -> Array:
-    """-s'(y), (m,), of cones too."""
-    return _forces(given, None if given.cones is None else _total(given.cones), y)[0]
+def excess(given: Constraints, a: Array) -> Rows:
+    """y = J a - aref."""
+    pairs = zip(_turned(given, a), (given.aref, *(c.aref for c in given.cones)), strict=True)
+    return tuple(turned - aref for turned, aref in pairs)
 
 
-def hessian(given: Constraints, y: Array, product: Callable[..., Array] = jnp.matmul) -> Array:
-    """M + J' s''(y) J, (nv, nv)."""
-    _, active = law(given, y)
-    bent = given.J * active[:, None]
-    if given.cones is not None:
-        at = elliptic.place(given.cones, _total(given.cones), y)
-        bent = bent + product(elliptic.curvature(given.cones, at), given.J)
-    return given.M + product(bent.T, given.J)
+def _turned(given: Constraints, a: Array) -> Rows:
+    """J a."""
+    return (times(given.J, a), *(jnp.sum(c.J * a[None, None, :], axis=-1) for c in given.cones))
 
 
-def _total(cones: elliptic.Cones) -> elliptic.Total:
-    return partial(times, elliptic.together(cones))
+def forces(given: Constraints, y: Rows) -> Rows:
+    """-s'(y)."""
+    return _forces(given, y)[0]
 
 
-def _forces(
-    given: Constraints, total: elliptic.Total | None, y: Array
-) -> tuple[Array, elliptic.Place | None]:
+def _forces(given: Constraints, y: Rows) -> tuple[Rows, list[elliptic.Place]]:
     """-s'(y), and where cones are."""
-    push, _ = law(given, y)
-    if given.cones is None or total is None:
-        return push, None
-    at = elliptic.place(given.cones, total, y)
-    return push + elliptic.forces(given.cones, at), at
+    at = _places(given, y)
+    pushes = [elliptic.forces(*each) for each in zip(given.cones, at, strict=True)]
+    return (law(given, y[0])[0], *pushes), at
+
+
+def _places(given: Constraints, y: Rows) -> list[elliptic.Place]:
+    return [elliptic.place(*each) for each in zip(given.cones, y[1:], strict=True)]
+
+
+def pulled(given: Constraints, push: Rows) -> Array:
+    """J' times forces, (nv,)."""
+    found = transposed_times(given.J, push[0])
+    for cones, each in zip(given.cones, push[1:], strict=True):
+        found = found + jnp.sum(jnp.sum(cones.J * each[:, :, None], axis=0), axis=0)
+    return found
+
+
+def hessian(given: Constraints, y: Rows, product: Callable[..., Array] = jnp.matmul) -> Array:
+    """M + J' s''(y) J, (nv, nv)."""
+    _, active = law(given, y[0])
+    found = given.M + product((given.J * active[:, None]).T, given.J)
+    for cones, at in zip(given.cones, _places(given, y), strict=True):
+        by_row = [J.reshape(-1, J.shape[-1]) for J in (elliptic.curved(cones, at), cones.J)]
+        found = found + product(by_row[0].T, by_row[1])
+    return found
 
 
 def _line(
-    given: Constraints,
-    total: elliptic.Total | None,
-    at: elliptic.Place | None,
-    y: Array,
-    h: Array,
+    given: Constraints, at: list[elliptic.Place], y: Rows, h: Rows
 ) -> Callable[[Array], tuple[Array, Array]]:
-    """size, (..., 1) or () -> `changes` from y to y + size h, with those of cones."""
-    cones = given.cones
-    if cones is None or total is None or at is None:
-        return lambda size: changes(given, y, size * h)
-    of_cones = partial(elliptic.changes, cones, at, elliptic.ray(cones, total, at, h))
+    """size, (...,) -> sums of `changes` from y to y + size h, and their slopes, (...,)."""
+    rays = [elliptic.ray(*each) for each in zip(given.cones, at, h[1:], strict=True)]
 
-    def both(size: Array) -> tuple[Array, Array]:
-        pairs = zip(changes(given, y, size * h), of_cones(size), strict=True)
-        change, rise = (a + b for a, b in pairs)
-        return change, rise
+    def line(size: Array) -> tuple[Array, Array]:
+        by_row, rise = changes(given, y[0], size[..., None] * h[0])
+        change, slope = jnp.sum(by_row, axis=-1), jnp.sum(rise * h[0], axis=-1)
+        for cones, place, ray, along in zip(given.cones, at, rays, h[1:], strict=True):
+            by_contact, rise = elliptic.changes(cones, place, ray, size)
+            change = change + jnp.sum(by_contact, axis=-1)
+            slope = slope + jnp.sum(jnp.sum(rise * along, axis=-1), axis=-1)
+        return change, slope
 
-    return both
+    return line
 
 
 def iterated(
@@ -156,31 +172,32 @@ def iterated(
         newton: newton(H, g) -> H^{-1} g, and what is left of H.
         left: an array like what is left, or None.
     """
-    M, J, a0 = given.M, given.J, given.a0
+    M, a0 = given.M, given.a0
     eps, sizes = jnp.finfo(a0.dtype).eps, jnp.exp2(-lax.iota(jnp.int32, SIZES).astype(a0.dtype))
-    total = None if given.cones is None else _total(given.cones)
 
     def iteration(carry: Any) -> Any:
         count, _, *here, nothing, _ = carry
-        _, rest, y = here
-        push, at = _forces(given, total, y)
-        pull = transposed_times(J, push)
+        _, rest, *ys = here
+        y = tuple(ys)
+        push, at = _forces(given, y)
+        pull = pulled(given, push)
         gradient = rest - pull
         direction, left = newton(hessian(given, y, product), gradient)
-        along = direction, times(M, direction), times(J, direction)
+        turns = _turned(given, direction)
+        along = direction, times(M, direction), *turns
         first, second = jnp.sum(gradient * direction), jnp.sum(direction * along[1])
 
-        line = _line(given, total, at, y, -along[2])
+        line = _line(given, at, y, tuple(-each for each in turns))
 
-        def tried(sizes: Array, each: Array) -> tuple[Array, Array]:
+        def tried(sizes: Array) -> tuple[Array, Array]:
             """Change of what is minimized by steps of these sizes, and its slope there."""
-            of_rows, rise = line(each)
-            change = nothing + sizes * (0.5 * sizes * second - first) + jnp.sum(of_rows, axis=-1)
-            return change, sizes * second - first - jnp.sum(rise * along[2], axis=-1)
+            change, slope = line(sizes)
+            change = nothing + sizes * (0.5 * sizes * second - first) + change
+            return change, sizes * second - first + slope
 
-        change, slope = tried(sizes, sizes[:, None])
+        change, slope = tried(sizes)
         size, least = _level(sizes, slope, -first), jnp.min(change)
-        between, _ = tried(size, size)
+        between, _ = tried(size)
         on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
         inside = between < least
         size, least = jnp.where(inside, size, on_ladder), jnp.where(inside, between, least)
@@ -192,7 +209,7 @@ def iterated(
 
     none = jnp.zeros_like(a0)
     # Without a number that is carried on, the compiler of kernels crashes; this one stays 0
-    begin = 0, True, none, none, times(J, a0) - given.aref, jnp.zeros((), a0.dtype), left
+    begin = 0, True, none, none, *excess(given, a0), jnp.zeros((), a0.dtype), left
     end = lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], iteration, begin)
     return a0 + end[2], end[-1]
 
@@ -219,15 +236,14 @@ def _plain(given: Constraints) -> tuple[Array, Array]:
 
 def _hessian_at(given: Constraints, a: Array) -> Array:
     """The Hessian at a, symmetric to the last bit."""
-    return symmetric(hessian(given, times(given.J, a) - given.aref))
+    return symmetric(hessian(given, excess(given, a)))
 
 
 def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Array]:
     given = repeated(has_rows, given)
-    rows, nv = given.J.shape[-2:]
+    nv = given.a0.shape[-1]
     most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
-    most = most if given.cones is None else min(most, MOST_IN_CONES)
-    fits = rows <= most and given.M.dtype == np.float32
+    fits = _rows(given) <= most and given.M.dtype == np.float32
     plain = jax.vmap(_plain)
     if not (on_gpu() and fits and of_one_precision(jax.tree.leaves(given))):
         return plain(given)
@@ -248,26 +264,34 @@ constrained_minimum = merged_vmaps(_plain, _all_rows)
 
 def minima(given: Constraints, interpret: bool = False) -> Array:
     """The accelerations (rows, nv) by the kernel; every array leads with the axis of rows."""
-    m, n = given.J.shape[-2:]
-    M, N = tile(m), tile(n)
-    shapes = (N, N), (M, N), (M,), (M,), (M,), (M,), (N,)
-    arrays = [padded(a, *shape) for a, shape in zip(given[:-1], shapes, strict=True)]
-    arrays += [padded(a, M) for a in given.cones or ()]
+    n = given.a0.shape[-1]
+    tiles = jax.tree.map(lambda a: padded(a, *map(tile, a.shape[1:])), given._replace(cones=()))
+    tiles = tiles._replace(cones=tuple(_tiles(cones, tile(n)) for cones in given.cones))
+    arrays, tree = jax.tree.flatten(tiles)
     precision = lax.Precision.HIGHEST if interpret else SPLIT
-    body = partial(_body, n, partial(product, precision=precision))
-    alone = M <= MOST_OF_ONE_WARP if given.cones is None else M == LEAST
-    found = block_for_each_row(
-        body, {"a": (len(arrays[0]), N)}, arrays, 1 if alone else 4, interpret
-    )
-    return found["a"][:, :n]
+    body = partial(_body, n, tree, partial(product, precision=precision))
+    warps = 1 if _rows(tiles) <= MOST_OF_ONE_WARP else 4
+    shapes = {"a": tiles.a0.shape}
+    return block_for_each_row(body, shapes, arrays, warps, interpret)["a"][:, :n]
 
 
-def _body(n: int, product: Callable[..., Array], *refs: Any) -> None:
+def _rows(given: Constraints) -> int:
+    """How many rows J has, with those of cones."""
+    return int(given.D.shape[-1] + sum(np.prod(c.aref.shape[-2:]) for c in given.cones))
+
+
+def _tiles(cones: elliptic.Cones, columns: int) -> elliptic.Cones:
+    """The cones with powers of two of everything, and no less rows than a tile."""
+    d, c = (1 << (size - 1).bit_length() for size in cones.aref.shape[1:])
+    c = max(c, LEAST // d)
+    shapes = (d, c, columns), (d, c), (d, c), (c,), (c,)
+    return elliptic.Cones(*(padded(a, *shape) for a, shape in zip(cones, shapes, strict=True)))
+
+
+def _body(n: int, tree: Any, product: Callable[..., Array], *refs: Any) -> None:
     """One row."""
     *inputs, out = refs
-    M, J, D, aref, lower, upper, a0, *of_cones = (ref[0] for ref in inputs)
-    cones = elliptic.Cones(*of_cones) if of_cones else None
-    given = Constraints(M, J, D, aref, lower, upper, a0, cones)
+    given: Constraints = jax.tree.unflatten(tree, [ref[0] for ref in inputs])
 
     def newton(H: Array, gradient: Array) -> tuple[Array, None]:
         return -times(swept(H, n), gradient), None

@@ -28,7 +28,13 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from mjx_drax.kernels.constraint_solver import Constraints, constrained_minimum, forces
+from mjx_drax.kernels.constraint_solver import (
+    Constraints,
+    constrained_minimum,
+    excess,
+    forces,
+    pulled,
+)
 from mjx_drax.kernels.elliptic_cones import Cones
 from mjx_drax.kernels.linalg import solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
@@ -123,23 +129,34 @@ def _springs(model: mjx.Model, turned: np.ndarray, qpos: Array) -> Array:
 
 def _constraints(model: mjx.Model, data: mjx.Data) -> Constraints:
     """What the acceleration under constraints minimizes."""
-    rows, cones = internal(data), None
+    rows = internal(data)
     loss, D = rows.efc_frictionloss, rows.efc_D
     slides = loss / jnp.where(D > 0.0, D, 1.0)
     always = np.arange(len(D)) < rows.ne + rows.nf
     held = jnp.where(always, jnp.inf, 0.0).astype(D.dtype)
     lower = jnp.where(loss > 0.0, -slides, -jnp.inf)
     upper = jnp.where(loss > 0.0, slides, held)
-    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-        cones, D = _cones(model, data)
-    return Constraints(rows.M, rows.efc_J, D, rows.efc_aref, lower, upper, data.qacc_smooth, cones)
+    rest = D, rows.efc_aref, lower, upper, data.qacc_smooth
+    given = Constraints(rows.M, rows.efc_J, *rest)
+    if not (in_cones := _rows_of_cones(model, data)):
+        return given
+    others = _others(len(D), in_cones)
+    by_row = {name: getattr(given, name)[others] for name in ("J", "D", "aref", "lower", "upper")}
+    return given._replace(**by_row, cones=tuple(_cones(model, data, at) for at in in_cones))
 
 
 def _forces(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Array]:
     """Forces of constraints at an acceleration: of all rows (m,), and on joints (nv,)."""
     given = _constraints(model, data)
-    found = forces(given, given.J @ qacc - given.aref)
-    return found, given.J.T @ found
+    found = forces(given, excess(given, qacc))
+    pull = pulled(given, found)
+    if not (in_cones := _rows_of_cones(model, data)):
+        return found[0], pull
+    by_row = jnp.zeros_like(internal(data).efc_D)
+    places = _others(len(by_row), in_cones), *in_cones
+    for place, force in zip(places, found, strict=True):
+        by_row = by_row.at[place].set(force)
+    return by_row, pull
 
 
 def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
@@ -147,21 +164,27 @@ def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
     return constrained_minimum(_constraints(*jax.lax.stop_gradient((model, data))))
 
 
-def _cones(model: mjx.Model, data: mjx.Data) -> tuple[Cones | None, Array]:
-    """The elliptic friction cones, and D (m,), 0 in their rows."""
-    contact, D = internal(data).contact, internal(data).efc_D
-    with_friction = np.flatnonzero(np.asarray(contact.dim) > 1)
-    if not len(with_friction):
-        return None, D
-    sizes, starts = (np.asarray(a)[with_friction] for a in (contact.dim, contact.efc_address))
-    which = np.repeat(np.arange(len(sizes)), sizes)
-    entry = np.concatenate([np.arange(size) for size in sizes])
-    at, rows = starts[which] + entry, jnp.zeros_like(D)
-    friction = contact.friction[with_friction]
+def _rows_of_cones(model: mjx.Model, data: mjx.Data) -> list[np.ndarray]:
+    """Numbers of the rows of elliptic friction cones, (d, contacts), for each d that there is."""
+    if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return []
+    contact = internal(data).contact
+    sizes, starts = np.asarray(contact.dim), np.asarray(contact.efc_address)
+    return [np.arange(d)[:, None] + starts[sizes == d] for d in np.unique(sizes[sizes > 1])]
+
+
+def _others(count: int, in_cones: list[np.ndarray]) -> np.ndarray:
+    """Numbers of the rows that belong to no cone."""
+    return np.setdiff1d(np.arange(count), np.concatenate([at.ravel() for at in in_cones]))
+
+
+def _cones(model: mjx.Model, data: mjx.Data, at: np.ndarray) -> Cones:
+    """The elliptic friction cones of contacts with those rows, (d, contacts)."""
+    rows, d = internal(data), len(at)
+    friction = rows.contact.friction[np.asarray(rows.contact.dim) == d]
     mu = friction[:, 0] / jnp.sqrt(model.opt.impratio)
-    scale = jnp.concatenate([mu[:, None], friction], axis=1)[which, entry]
-    values = 1.0 + which, entry == 0, scale, mu[which], (D[starts] / mu**2)[which]
-    return Cones(*(rows.at[at].set(value) for value in values)), D.at[at].set(0.0)
+    scale = jnp.concatenate([mu[None], friction.T[: d - 1]])
+    return Cones(rows.efc_J[at], rows.efc_aref[at], scale, mu, rows.efc_D[at[0]] / mu**2)
 
 
 def _constrained(
