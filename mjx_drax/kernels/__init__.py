@@ -1,1 +1,9 @@
 """Speed and nothing else: arrays in, arrays out, each kernel with a plain twin."""
+
+import pkgutil
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, submodules=[module.name for module in pkgutil.iter_modules(__path__)]
+)

@@ -1,1 +1,9 @@
 """Many chains and many attempts: the loops on the host, compilation, devices, checkpoints."""
+
+import pkgutil
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__, submodules=[module.name for module in pkgutil.iter_modules(__path__)]
+)
