@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_drax.solution.names import control_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
-from mjx_drax.solution.results import STALLED, UNFINISHED, Results
+from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
 from mjx_drax.solution.violations import GOAL, TRACKING, words
 
 OPTIMA = 5
@@ -111,27 +111,36 @@ def constraints(solution: Results) -> str:
 
 
 def optima_lines(solution: Results) -> list[str]:
-    """The cheapest of the distinct optima as a table; nothing if no chain is certified."""
+    """The cheapest of the distinct motions as a table; nothing if no chain is certified.
+
+    They are called optima if all of them are. Each row says what differs most from the first.
+    """
     found = solution.optima
+    label = "optima" if all(optimum.optimal for optimum in found) else "motions"
     if len(found) < 2:
-        return [f"optima         {_only(solution)}"] if found else []
-    outcomes = ("fails", "reaches goal")
-    if solution.problem.goal is None:
-        outcomes = ("fails", "keeps to plan")
-    table = [
-        f"optima         rank {'cost':>9}  chains  {'open loop':13}  {'with feedback':13}  residual"
-    ]
+        return [f"{label:14} {_only(solution)}"] if found else []
+    columns = f"rank {'cost':>9}  chains  {'replays':9}  residual  differs from the first"
+    table = [f"{label:14} {columns}"]
     for rank, optimum in enumerate(found[:OPTIMA], 1):
         replays = optimum.certificate.open_loop, optimum.certificate.feedback
-        open_loop, feedback = (outcomes[replay["success"]] for replay in replays)
+        both = all(replay["success"] for replay in replays)
+        which = "both" if both else OPEN_LOOP if replays[0]["success"] else "feedback"
         residual = f"{optimum.residual:.1e}" if math.isfinite(optimum.residual) else "-"
-        table.append(
-            f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {open_loop:13}  {feedback:13}  "
-            f"{residual}"
-        )
+        apart = _apart(solution, found[0], optimum) if rank > 1 else ""
+        row = f"{rank:19} {optimum.cost:9.5g}  {optimum.share:6.1%}  {which:9}  {residual:8}"
+        table.append(f"{row}  {apart}".rstrip())
     if len(found) > OPTIMA:
         table.append(f"{'':14} and {len(found) - OPTIMA} more")
     return table
+
+
+def _apart(solution: Results, first: Optimum, other: Optimum) -> str:
+    """Which state of a plan differs most from the first's, by the range that it has in both."""
+    both = np.stack([first.trajectory.x, other.trajectory.x])
+    widths = np.maximum(np.ptp(both, axis=(0, 1)), np.finfo(both.dtype).tiny)
+    k, i = np.unravel_index(np.argmax(np.abs(both[1] - both[0]) / widths), both.shape[1:])
+    name = state_names(solution.problem.dynamics)[i]
+    return f"{name} by {both[1, k, i] - both[0, k, i]:+.3g} at knot {k + 1}"
 
 
 def _only(solution: Results) -> str:

@@ -272,15 +272,21 @@ def test_result_files_and_tables_are_bounded(hill, monkeypatch):
     assert lines[-1].split() == ["and", str(found - 3), "more"]
 
 
-def test_table_tells_cost_share_and_replays(hill):
-    heading, first, second = optima_lines(hill)
-    assert " ".join(heading.split()) == "optima rank cost chains open loop with feedback residual"
-    for rank, line in enumerate((first, second), 1):
+def test_table_tells_cost_share_replays_and_what_differs(hill):
+    heading, *rows = (line.split() for line in optima_lines(hill))
+    assert " ".join(heading) == "motions rank cost chains replays residual differs from the first"
+    for rank, row in enumerate(rows, 1):
         optimum = hill.optima[rank - 1]
-        assert line.split()[:3] == [str(rank), f"{optimum.cost:.5g}", f"{optimum.share:.1%}"]
-        assert " ".join(line.split()[3:]) == "reaches goal reaches goal -"
+        assert row[:3] == [str(rank), f"{optimum.cost:.5g}", f"{optimum.share:.1%}"]
+        assert row[3:5] == ["both", "-"]
+    x, y = (optimum.trajectory.x for optimum in hill.optima)
+    name, by, size, *_, knot = rows[1][5:]
+    there = int(knot) - 1, int(name.removeprefix("x"))
+    assert (by, size) == ("by", f"{y[there] - x[there]:+.3g}")
+    assert abs(y[there] - x[there]) == pytest.approx(np.abs(y - x).max(axis=0)[there[1]])
+    assert rows[0][5:] == []
     lost = replace(hill, open_loop=replace(hill.open_loop, success=np.zeros(16, bool)))
-    assert " ".join(optima_lines(lost)[1].split()[3:]) == "fails reaches goal -"
+    assert optima_lines(lost)[1].split()[3] == "feedback"
 
 
 @pytest.mark.slow
@@ -312,11 +318,11 @@ def test_the_command_writes_a_picture_only_of_several(tmp_path, capsys, monkeypa
     assert main(arguments) == 0
     out = capsys.readouterr().out
     assert "optima.png" in out
-    assert "optima         rank" in out
+    assert "motions        rank" in out
     assert (tmp_path / "optima.png").stat().st_size > 1000
     (tmp_path / "optima.png").unlink()
     one = failed(hill, hill.optima[1].members)
     monkeypatch.setattr("mjx_drax.solution.solve.solve", lambda *_, **__: one)
     assert main(arguments) == 0
-    assert "optima         one" in capsys.readouterr().out
+    assert "motions        one" in capsys.readouterr().out
     assert not (tmp_path / "optima.png").exists()
