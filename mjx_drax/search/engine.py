@@ -48,6 +48,7 @@ from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
     begin,
+    between,
     chain_keys,
     iterate,
     joined,
@@ -71,6 +72,9 @@ STRAGGLERS = 0.0005
 
 CHEAPER = 1e-3
 """A rollout is an improvement if it is cheaper by more than this share."""
+
+SHARES = (0.5, 0.2, 0.05)
+"""Of what a round has changed, these are rolled out where all of it brings no improvement."""
 
 FAR, COOLER, MOST_COOLINGS = 10.0, 0.25, 4
 """Where noise brings max|h| of most chains to so many times that of the initial knots (or its own
@@ -766,10 +770,9 @@ class Search:
         state, info = self._iterated(state, end - iterations, end)
         missed = np.ones(len(everyone), bool)  # until it is shown
         found = self._whole(Chains(state, info, np.full(len(everyone), done), missed))
-        found = self._rolled_out(found, 1.0, done)
-        better = _improved(now, found, np.repeat(stage.floor[self.indices], self.chains))
+        found, better = self._rolled_out_in_part(now, found, done)
         now = best_of(now, found, everyone)
-        factor = np.where(better, LESS_DAMPING, MORE_DAMPING)
+        factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))
         damping = np.clip(damping * factor, *DAMPING_RANGE)
         if not better.any() and (damping == DAMPING_RANGE[1]).all():
             count = total  # more would change nothing
@@ -799,6 +802,39 @@ class Search:
         if with_feedback:  # a plan is fine that is reached in one of two ways
             missed = missed & chains.missed
         return best_of(replace(chains, missed=missed), found, np.arange(len(x)))
+
+    def _rolled_out_in_part(
+        self, now: Chains, whole: Chains, done: int
+    ) -> tuple[Chains, np.ndarray]:
+        """Rollouts of what a round has made of chains `now`, or of a share if that is no better.
+
+        Also which share has brought an improvement, 0 for none, (rows,).
+        """
+        floor = np.repeat(self.stage.floor[self.indices], self.chains)
+        found, everyone = self._rolled_out(whole, 1.0, done), np.arange(len(now.missed))
+        better = np.where(_improved(now, found, floor), 1.0, 0.0)
+        for share in SHARES:
+            settled = better > 0.0
+            if settled.all():
+                break
+            part = self._rolled_out(self._part_way(now, whole, share), 1.0, done)
+            # What is settled stays: answers must not depend on neighbours in a batch
+            info = jax.tree.map(partial(jnp.where, settled, jnp.inf), part.info)
+            part = replace(part, info=info)
+            better[_improved(now, part, floor)] = share
+            found = best_of(found, part, everyone)
+        return found, better
+
+    def _part_way(self, now: Chains, found: Chains, share: float) -> Chains:
+        """Chains whose knots are a share of the way from those of now to those found.
+
+        They are for rollouts only: nothing is known of them, and so they count as infinitely bad.
+        """
+        ends = now.state.trajectory, found.state.trajectory
+        knots = between(self.question[1], self.question[0], *ends, share)
+        state = replace(found.state, trajectory=replace(knots, slack=ends[1].slack))
+        unknown: Any = np.full(len(found.missed), np.inf, knots.x.dtype)
+        return replace(found, state=state, info=Info.of(unknown))
 
     def _plans(self, knots: Trajectory) -> np.ndarray:
         """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""

@@ -120,6 +120,22 @@ def restart_at(own: Question, shared: Question, states: State, knots: Trajectory
 
 
 @jax.jit
+def between(
+    own: Question, shared: Question, here: Trajectory, there: Trajectory, share: ArrayLike
+) -> Trajectory:
+    """Knots a share of the way from here to there, (rows, K, ...), without slacks."""
+
+    def of_row(q: Question, a: Trajectory, b: Trajectory) -> Trajectory:
+        a, b = (replace(knots, slack=None) for knots in (a, b))
+        way = jax.tree.map(jnp.subtract, b, a)
+        way = replace(way, x=jax.vmap(q.problem.dynamics.difference)(b.x, a.x))
+        return q.problem.displaced(a, jax.tree.map(lambda d: share * d, way))
+
+    knots: Trajectory = by_row(shared, own, of_row, here, there)
+    return knots
+
+
+@jax.jit
 def worst_constraints(own: Question, shared: Question, knots: Trajectory) -> Array:
     """The largest violation of each row's constraints, whatever its dynamics, (rows,)."""
 

@@ -63,7 +63,8 @@ class Rollouts:
     Where contacts switch, linear models of f are wrong, and steps that trust them leave defects. A
     rollout has none. So each chain takes its rollout, and then every few iterations of the polish,
     or of the tail without one, are rolled out with their feedback: what is feasible and cheaper is
-    kept, and chains for which it is not are damped more.
+    kept. Where it is not, shares of the change are rolled out, down to a twentieth, and the chain
+    is damped more if none of them helps.
 
     Attributes:
         first: rollouts right after the attempt: one without feedback, the others with it.

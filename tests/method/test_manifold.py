@@ -176,3 +176,15 @@ def test_given_knots_are_scaled_to_unit_quaternions(task):
     guess = Trajectory(x, np.zeros((K, 3)))
     seen = replace(task, guess=lambda key: guess).draw(None)
     np.testing.assert_allclose(seen.x[:, :4], 0.5)
+
+
+def test_a_share_of_the_way_between_two_plans_turns_by_that_share():
+    ball = problem()
+    keys = jax.random.split(jax.random.key(0))
+    here, there = (jax.vmap(ball.draw)(jax.random.split(key, 2)) for key in keys)
+    shared, own = iterate.partition(iterate.Question(Langevin(), ball), None)
+    part = iterate.between(own, shared, here, there, 0.25)
+    off = jax.vmap(jax.vmap(Spinning().difference))
+    np.testing.assert_allclose(off(part.x, here.x), 0.25 * off(there.x, here.x), atol=1e-5)
+    np.testing.assert_allclose(part.u, here.u + 0.25 * (there.u - here.u), atol=1e-6)
+    np.testing.assert_allclose(jnp.linalg.norm(part.x[..., :4], axis=-1), 1.0, atol=1e-5)
