@@ -148,9 +148,11 @@ def _only(solution: Results) -> str:
     costs = solution.replay_cost[solution.certified_chains]
     if len(costs) == 1:
         return "one: no other chain is certified"
+    same = np.ptp(costs) <= ALIKE * abs(costs.min())
+    motion = "the same motion" if same else "similar motions"
     return (
-        f"one: {len(costs)} certified chains make the same motion, at costs from "
-        f"{costs.min():.5g} to {costs.max():.5g}"
+        f"one: {len(costs)} certified chains make {motion}, at costs from {costs.min():.5g} to "
+        f"{costs.max():.5g}"
     )
 
 

@@ -226,20 +226,18 @@ class Results:
     def best_chain(self) -> int:
         """The certified chain with the cheapest replay; else a feasible, or the least infeasible.
 
-        Of certified chains that cost as much, up to 1e-4 of it, an optimal one; of feasible chains
-        the one with the cheapest plan.
+        Of certified chains that cost as much, up to 1e-4 of it, an optimal one. Plans of feasible
+        chains say little where a replay does not follow them: there replays are compared, too.
         """
         if self.certified_chains.any():
             least = self.replay_cost[self.certified_chains].min()
             alike = self.optimal_chains & (self.replay_cost <= least + SAME_COST * abs(least))
             if alike.any():
                 return int(np.argmin(np.where(alike, self.replay_cost, np.inf)))
-        for eligible, cost in (
-            (self.certified_chains, self.replay_cost),
-            (self.feasible, self.cost),
-        ):
+        costs = np.nan_to_num(self.replay_cost, nan=np.inf)
+        for eligible in (self.certified_chains, self.feasible):
             if eligible.any():
-                return int(np.argmin(np.where(eligible, cost, np.inf)))
+                return int(np.argmin(np.where(eligible, costs, np.inf)))
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
 
     def chain_or_best(self, chain: int | None) -> int:
@@ -342,7 +340,10 @@ class Results:
     def optimality(self) -> str:
         """What is known of the best chain's optimality, in words."""
         best, problem = self.best_chain, self.problem
-        words = optimality(float(self.residual[best]), self.tolerance, self.polished[best])
+        ending = self.polished[best]
+        if self.interrupted and ending == UNFINISHED:
+            ending = "interrupted"
+        words = optimality(float(self.residual[best]), self.tolerance, ending)
         rounded = problem.precision == 32 and not problem.dynamics.kinked
         more = self.polished[best] == STALLED and rounded
         return f"{words}; precision=64 may get further" if more else words
@@ -402,6 +403,7 @@ def optimality(residual: float, tolerance: float, ending: str) -> str:
     how = {
         STALLED: ": the polish stalled",
         UNFINISHED: ": the polish is unfinished (max_iterations)",
+        "interrupted": ": the polish was interrupted",
     }
     return f"residual {residual:.1e}, above {tolerance:g}{how.get(ending, '')}"
 
