@@ -1,9 +1,5 @@
 """Helpers to pose a problem: terms of costs, distances, obstacles, initial guesses."""
 
-import pkgutil
+from mjx_drax.base.rooms import by_name
 
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__, submodules=[module.name for module in pkgutil.iter_modules(__path__)]
-)
+__getattr__, __dir__, __all__ = by_name(__name__, __path__)

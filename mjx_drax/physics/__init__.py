@@ -1,9 +1,5 @@
 """From a MuJoCo model to dynamics. The only room that imports mujoco and mjx, but for drawing."""
 
-import pkgutil
+from mjx_drax.base.rooms import by_name
 
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__, submodules=[module.name for module in pkgutil.iter_modules(__path__)]
-)
+__getattr__, __dir__, __all__ = by_name(__name__, __path__)
