@@ -788,7 +788,16 @@ class Search:
         return ran, ~family.reached(ran.states)
 
     def _rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
-        """The best of chains and of rollouts of their controls, which become their knots."""
+        """The best of chains and of their rollouts."""
+        found, missed = self._rollouts(chains, with_feedback, done)
+        if with_feedback:  # a plan is fine that is reached in one of two ways
+            missed = missed & chains.missed
+        return best_of(replace(chains, missed=missed), found, np.arange(len(missed)))
+
+    def _rollouts(
+        self, chains: Chains, with_feedback: float, done: int
+    ) -> tuple[Chains, np.ndarray]:
+        """Rollouts of the chains' controls as their knots; and which miss, as in `_replayed`."""
         knots, (ran, missed) = chains.state.trajectory, self._replayed(chains, with_feedback)
         x, u = (jnp.asarray(a, knots.x.dtype) for a in (ran.states[:, 1:], ran.controls))
         rolled = Trajectory(x, u, start=knots.start)
@@ -798,43 +807,33 @@ class Search:
         if self.family.problem.goal is not None:
             ran_to = replace(gathered(state.trajectory, self.mesh), slack=None)
             own, info = missed, self._by_the_engine(info, ran_to, ~missed)
-        found = self._whole(Chains(state, info, np.full(len(x), done), own))
-        if with_feedback:  # a plan is fine that is reached in one of two ways
-            missed = missed & chains.missed
-        return best_of(replace(chains, missed=missed), found, np.arange(len(x)))
+        return self._whole(Chains(state, info, np.full(len(x), done), own)), missed
 
     def _rolled_out_in_part(
         self, now: Chains, whole: Chains, done: int
     ) -> tuple[Chains, np.ndarray]:
-        """Rollouts of what a round has made of chains `now`, or of a share if that is no better.
+        """What a round has made of chains `now`, rolled out; or a share of it, where all is worse.
 
         Also which share has brought an improvement, 0 for none, (rows,).
         """
         floor = np.repeat(self.stage.floor[self.indices], self.chains)
         found, everyone = self._rolled_out(whole, 1.0, done), np.arange(len(now.missed))
         better = np.where(_improved(now, found, floor), 1.0, 0.0)
+        ends = now.state.trajectory, whole.state.trajectory
         for share in SHARES:
             settled = better > 0.0
             if settled.all():
                 break
-            part = self._rolled_out(self._part_way(now, whole, share), 1.0, done)
+            knots = between(self.question[1], self.question[0], *ends, share)
+            knots = replace(knots, slack=ends[1].slack)  # unused; nothing compiles again
+            state = replace(whole.state, trajectory=knots)
+            part, _ = self._rollouts(replace(whole, state=state), 1.0, done)
             # What is settled stays: answers must not depend on neighbours in a batch
             info = jax.tree.map(partial(jnp.where, settled, jnp.inf), part.info)
             part = replace(part, info=info)
             better[_improved(now, part, floor)] = share
             found = best_of(found, part, everyone)
         return found, better
-
-    def _part_way(self, now: Chains, found: Chains, share: float) -> Chains:
-        """Chains whose knots are a share of the way from those of now to those found.
-
-        They are for rollouts only: nothing is known of them, and so they count as infinitely bad.
-        """
-        ends = now.state.trajectory, found.state.trajectory
-        knots = between(self.question[1], self.question[0], *ends, share)
-        state = replace(found.state, trajectory=replace(knots, slack=ends[1].slack))
-        unknown: Any = np.full(len(found.missed), np.inf, knots.x.dtype)
-        return replace(found, state=state, info=Info.of(unknown))
 
     def _plans(self, knots: Trajectory) -> np.ndarray:
         """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""

@@ -327,6 +327,17 @@ def test_rollouts_follow_where_f_has_kinks(balls):
         assert path.iteration[-1] == kinked.iterations
 
 
+@pytest.mark.slow
+def test_where_all_that_a_round_changes_is_worse_a_share_of_it_helps(balls, monkeypatch):
+    solver = Restarts(attempts=1, polish=Polish(iterations=0))
+    in_part = solve(balls[1], chains=8, solver=solver)
+    monkeypatch.setattr("mjx_drax.search.engine.SHARES", ())
+    whole = solve(balls[1], chains=8, solver=solver)
+    assert in_part.feasible.all()
+    assert (in_part.cost < whole.cost).all()
+    assert np.median(in_part.cost) < 0.6 * np.median(whole.cost)
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Heavier(FunctionDynamics):

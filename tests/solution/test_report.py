@@ -148,3 +148,6 @@ def test_one_motion_of_one_chain_or_of_several():
     assert "2 certified chains make the same motion, at costs from 0 to 0" in str(made)
     lost = replace(made, max_defect=np.array([0.0, 1.0], np.float32))
     assert "one: no other chain is certified" in str(lost)
+    dear = replace(made.open_loop, cost=np.array([1.0, 1.2], np.float32))
+    unlike = replace(made, open_loop=dear, feedback=dear)
+    assert "2 certified chains make similar motions, at costs from 1 to 1.2" in str(unlike)

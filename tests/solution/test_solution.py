@@ -538,3 +538,11 @@ def test_of_chains_that_cost_the_same_the_best_is_an_optimal_one():
     assert made.best_chain == 0
     assert replace(made, residual=np.array([1.0, 1e-5, 1e-5])).best_chain == 1
     assert replace(made, residual=np.array([1.0, 1.0, 1e-5])).best_chain == 0
+
+
+def test_without_a_certificate_the_best_is_the_feasible_chain_with_the_cheapest_replay():
+    made = made_up(point(goal=lambda x: False), 4)
+    costs = np.array([np.nan, 1100.0, 4.5, 0.1])
+    replays = replace(made.open_loop, cost=costs, success=np.zeros(4, bool))
+    plans = {"cost": np.array([1.0, 1.9, 2.5, 0.1]), "max_defect": np.array([0.0, 0.0, 0.0, 1.0])}
+    assert replace(made, open_loop=replays, feedback=replays, **plans).best_chain == 2

@@ -304,6 +304,8 @@ def test_optimal_is_certified_with_a_small_residual():
     assert others.verdict == "CERTIFIED, not known to be optimal"
     unfinished = "residual 1.0e-02, above 0.0001: the polish is unfinished (max_iterations)"
     assert others.optimality == unfinished
+    stopped = replace(others, interrupted=True)
+    assert stopped.optimality == "residual 1.0e-02, above 0.0001: the polish was interrupted"
     others = replace(others, stalled=np.array([True, True, False, False]))
     stalled = "residual 1.0e-02, above 0.0001: the polish stalled; precision=64 may get further"
     assert others.optimality == stalled
