@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_drax import tasks
-from mjx_drax.base.errors import DraxError, require_not_negative
+from mjx_drax.base.errors import require_not_negative
 from mjx_drax.base.files import write_json
 from mjx_drax.cli import pictures
 from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
@@ -67,16 +67,10 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.control import trials as runs
     from mjx_drax.control.mpc import MPC
     from mjx_drax.control.plant import Plant
-    from mjx_drax.physics.dynamics import mujoco_model
     from mjx_drax.solution.save import writable
     from mjx_drax.view.video import check as require_drawing
 
     problem = make(tasks.load(options.task), options.horizon)
-    if mujoco_model(problem.dynamics) is None:
-        raise DraxError(
-            f"{problem.name} has no model to drive: choose one of the tasks that `mjx-drax list` "
-            'calls "from MJCF".'
-        )
     names = ("chains", "explorers", "iterations", "every", "hold", "seed")
     policy = MPC(problem, **{name: getattr(options, name) for name in names})
     usual = float(problem.times[-1]) + 8.0

@@ -148,7 +148,6 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     """The same, in the precision that JAX has now; `stack` closes what it opens."""
     problem, solver, chains, draw = _asked(options)
-    from mjx_drax.physics.dynamics import mujoco_model
     from mjx_drax.search.restarts import settled
     from mjx_drax.solution import save as results
     from mjx_drax.solution.solve import solve
@@ -168,13 +167,9 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     room = results.expected_size(problem, chains)
     folder = results.writable(options.out or Path("out") / problem.name, room)
     look = pictures.look_of(options)
-    if options.side_by_side and mujoco_model(problem.dynamics) is None:
-        raise DraxError(
-            f"{problem.name} has no MuJoCo model: --side-by-side films models only. Leave it out."
-        )
     if look or options.film is not None or options.side_by_side:
         seen = pictures.without_caption(look)
-        require_drawing(problem, draw=draw, **seen)
+        require_drawing(problem, draw=draw, compared=options.side_by_side, **seen)
     film = None if options.film is None else pictures.film_path(options.film, folder)
     tell = say_nothing if options.quiet or options.json else say
     record: Any = 1 if film else None

@@ -75,7 +75,10 @@ class Plant:
         """
         model = mujoco_model(problem.dynamics)
         if model is None:
-            raise DraxError(f"{problem.name} has no model to simulate: use from_mjcf.")
+            raise DraxError(
+                f"{problem.name} has no model to simulate: use from_mjcf, or one of the tasks that "
+                '`mjx-drax list` calls "from MJCF".'
+            )
         require_not_negative("noise", noise)
         require_not_negative("shaking", shaking)
         require_positive("mass", mass, "a positive factor, 1 for no error")

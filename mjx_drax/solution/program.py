@@ -138,12 +138,11 @@ class Minimum:
     def _report(self) -> list[str]:
         best, where = self.best_chain, self.where(self.best_chain)
         broken = "" if where is None else f": {where.told(self.program)}"
-        found = optimality(float(self.residual[best]), self.tolerance, self.polished[best])
         return [
             *([INTERRUPTED] if self.interrupted else []),
             f"chains         {len(self.cost)}: {counts(self.status)}",
             f"best           cost {self.cost[best]:.5g}, max|h| {self.max_defect[best]:.1e}",
-            f"optimality     {found}",
+            f"optimality     {optimality(self, best)}",
             f"x              {shown([float(f'{x:.6g}') for x in self.best], 160)}",
             f"{self.status[best]}{broken}",
         ]

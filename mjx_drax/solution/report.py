@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from mjx_drax.solution.names import control_names, state_names
+from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
 from mjx_drax.solution.violations import GOAL, TRACKING, words
@@ -135,12 +135,14 @@ def optima_lines(solution: Results) -> list[str]:
 
 
 def _apart(solution: Results, first: Optimum, other: Optimum) -> str:
-    """Which state of a plan differs most from the first's, by the range that it has in both."""
-    both = np.stack([first.trajectory.x, other.trajectory.x])
-    widths = np.maximum(np.ptp(both, axis=(0, 1)), np.finfo(both.dtype).tiny)
-    k, i = np.unravel_index(np.argmax(np.abs(both[1] - both[0]) / widths), both.shape[1:])
-    name = state_names(solution.problem.dynamics)[i]
-    return f"{name} by {both[1, k, i] - both[0, k, i]:+.3g} at knot {k + 1}"
+    """Which coordinate of a plan differs most from the first's, by the range it has in both."""
+    dynamics = solution.problem.dynamics
+    here, there = (np.asarray(optimum.trajectory.x) for optimum in (first, other))
+    off = dynamics.host_difference(there, here)
+    both = dynamics.host_difference(np.concatenate([here, there]), here[:1])
+    widths = np.maximum(np.ptp(both, axis=0), np.finfo(both.dtype).tiny)
+    k, i = np.unravel_index(np.argmax(np.abs(off) / widths), off.shape)
+    return f"{difference_names(dynamics)[i]} by {off[k, i]:+.3g} at knot {k + 1}"
 
 
 def _only(solution: Results) -> str:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
@@ -340,10 +341,7 @@ class Results:
     def optimality(self) -> str:
         """What is known of the best chain's optimality, in words."""
         best, problem = self.best_chain, self.problem
-        ending = self.polished[best]
-        if self.interrupted and ending == UNFINISHED:
-            ending = "interrupted"
-        words = optimality(float(self.residual[best]), self.tolerance, ending)
+        words = optimality(self, best)
         rounded = problem.precision == 32 and not problem.dynamics.kinked
         more = self.polished[best] == STALLED and rounded
         return f"{words}; precision=64 may get further" if more else words
@@ -394,18 +392,16 @@ def stalled_of(state: State) -> np.ndarray:
     return np.asarray(progress.stalled if known else np.zeros(len(state.trajectory.u), bool))
 
 
-def optimality(residual: float, tolerance: float, ending: str) -> str:
-    """What a residual says, in words."""
+def optimality(found: Any, chain: int) -> str:
+    """What the residual of a chain says, in words; of a `Solution` or a `Minimum`."""
+    residual, tolerance = float(found.residual[chain]), found.tolerance
     if not np.isfinite(residual):
         return "residual not known"
     if residual < tolerance:
         return f"residual {residual:.1e}, below {tolerance:g}"
-    how = {
-        STALLED: ": the polish stalled",
-        UNFINISHED: ": the polish is unfinished (max_iterations)",
-        "interrupted": ": the polish was interrupted",
-    }
-    return f"residual {residual:.1e}, above {tolerance:g}{how.get(ending, '')}"
+    unfinished = "was interrupted" if found.interrupted else "is unfinished (max_iterations)"
+    how = {STALLED: ": the polish stalled", UNFINISHED: f": the polish {unfinished}"}
+    return f"residual {residual:.1e}, above {tolerance:g}{how.get(found.polished[chain], '')}"
 
 
 def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, ...]:

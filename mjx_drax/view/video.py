@@ -128,7 +128,7 @@ def render_comparison(
       DraxError: as `render`, or a problem without a model.
     """
     problem = solution.problem
-    check(problem, fps=fps, size=size, camera=camera, speed=speed)
+    check(problem, fps=fps, size=size, camera=camera, speed=speed, compared=True)
     model = mujoco_model(problem.dynamics)
     assert model is not None  # as checked
     chain = solution.chain_or_best(chain)
@@ -166,13 +166,22 @@ def check(
     camera: str | int | None = None,
     speed: float = 1.0,
     draw: Draw | None = None,
+    compared: bool = False,
 ) -> None:
-    """Complain before a solve about what `render` would refuse after it, such as a wrong camera."""
+    """Complain before a solve about what `render` would refuse after it, such as a wrong camera.
+
+    If `compared`, about what `render_comparison` would, which draws models only.
+    """
     frame_times(np.zeros(1), fps, speed)
     even_size(size)
     model = mujoco_model(problem.dynamics)
     if model is not None:
         camera_for(model, model.qpos0[None], camera, 1.0)
+    elif compared:
+        raise DraxError(
+            f"{problem.name} has no MuJoCo model: films side by side (--side-by-side) are of "
+            "models only. Leave it out."
+        )
     elif draw is None:
         raise DraxError(
             f"{problem.name} has no model to film: pass draw=, a function draw(axes, states) that "
@@ -283,7 +292,7 @@ def outcome_lines(
         problem.name,
         f"cost {cost:.3g}   max|h| {defect:.1g}",
         f"bound violation {violation:.1g}",
-        optimality(float(solution.residual[chain]), solution.tolerance, solution.polished[chain]),
+        optimality(solution, chain),
         made,
         told,
         "t = {time}",

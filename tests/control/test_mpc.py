@@ -317,4 +317,4 @@ def test_the_command_refuses_before_it_compiles(capsys):
     assert "mass is 0" in capsys.readouterr().err
     assert main(["mpc", "cartpole", "--pushes", "-1"]) == 2
     assert main(["mpc", "bug_trap"]) == 2
-    assert "bug_trap has no model to drive" in capsys.readouterr().err
+    assert "no model to simulate" in capsys.readouterr().err
