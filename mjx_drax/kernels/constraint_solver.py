@@ -16,6 +16,7 @@ the function are computed, and M a0, which is the sum of all other forces, is ne
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -52,9 +53,10 @@ ITERATIONS, SIZES = 20, 16
 DIGITS = 32.0
 """A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
-MOST_ROWS = ((32, 512), (64, 128))
-"""Most rows of J for which there is a kernel, up to so many columns.
+MOST_ROWS, MOST_WITH_CONES = ((32, 512), (64, 128)), 128
+"""Most rows of J, in tiles, for which there is a kernel, up to so many columns; and with cones.
 
+Beyond, arrays are used: nobody has measured the kernel there.
 On an H100, 275 rows of a hand's contacts, in 1,600 states, take 26 ms in the kernel and 70 ms as
 arrays; 72 rows of Spot's elliptic cones, in 8,960 states, 5.6 and 21 ms."""
 
@@ -243,6 +245,7 @@ def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Ar
     given = repeated(has_rows, given)
     nv = given.a0.shape[-1]
     most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
+    most = min(most, MOST_WITH_CONES) if given.cones else most
     fits = _rows(given) <= most and given.M.dtype == np.float32
     plain = jax.vmap(_plain)
     if not (on_gpu() and fits and of_one_precision(jax.tree.leaves(given))):
@@ -270,20 +273,25 @@ def minima(given: Constraints, interpret: bool = False) -> Array:
     arrays, tree = jax.tree.flatten(tiles)
     precision = lax.Precision.HIGHEST if interpret else SPLIT
     body = partial(_body, n, tree, partial(product, precision=precision))
-    warps = 1 if _rows(tiles) <= MOST_OF_ONE_WARP else 4
+    warps = 1 if _rows(given) <= MOST_OF_ONE_WARP else 4
     shapes = {"a": tiles.a0.shape}
     return block_for_each_row(body, shapes, arrays, warps, interpret)["a"][:, :n]
 
 
 def _rows(given: Constraints) -> int:
-    """How many rows J has, with those of cones."""
-    return int(given.D.shape[-1] + sum(np.prod(c.aref.shape[-2:]) for c in given.cones))
+    """How many rows J has in tiles, with those of cones."""
+    return tile(given.D.shape[-1]) + sum(math.prod(_tile(cones)) for cones in given.cones)
+
+
+def _tile(cones: elliptic.Cones) -> tuple[int, int]:
+    """Powers of two for d and c, and no less rows than a tile has."""
+    d, c = (1 << (size - 1).bit_length() for size in cones.aref.shape[-2:])
+    return d, max(c, LEAST // d)
 
 
 def _tiles(cones: elliptic.Cones, columns: int) -> elliptic.Cones:
-    """The cones with powers of two of everything, and no less rows than a tile."""
-    d, c = (1 << (size - 1).bit_length() for size in cones.aref.shape[1:])
-    c = max(c, LEAST // d)
+    """The cones, padded."""
+    d, c = _tile(cones)
     shapes = (d, c, columns), (d, c), (d, c), (c,), (c,)
     return elliptic.Cones(*(padded(a, *shape) for a, shape in zip(cones, shapes, strict=True)))
 
