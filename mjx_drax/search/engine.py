@@ -779,27 +779,37 @@ class Search:
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
 
     def _replayed(self, chains: Chains, with_feedback: float) -> tuple[Tracked, np.ndarray]:
-        """Replays of chains, and which of them miss the goal; without one, which leave the plan."""
-        knots, family = chains.state.trajectory, self.family
-        gains = with_feedback * np.asarray(chains.state.gains)
-        ran = family.tracked(self.indices, self._plans(knots), np.asarray(knots.u), gains)
-        if family.problem.goal is None:
-            return ran, ran.left
-        return ran, ~family.reached(ran.states)
+        """Replays of chains, and which of them miss; see `_tracked`."""
+        knots, gains = chains.state.trajectory, with_feedback * np.asarray(chains.state.gains)
+        return self._tracked(slice(None), self._plans(knots), np.asarray(knots.u), gains)
+
+    def _tracked(
+        self, rows: Any, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+    ) -> tuple[Tracked, np.ndarray]:
+        """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
+        family, of = self.family, np.repeat(self.indices, self.chains)
+        ran = family.tracked(of[rows], plan, u, gains)
+        return ran, ran.left if family.problem.goal is None else ~family.reached(ran.states)
 
     def _rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
         """The best of chains and of their rollouts."""
-        found, missed = self._rollouts(chains, with_feedback, done)
+        ran, missed = self._replayed(chains, with_feedback)
+        found = self._as_knots(chains, ran.states, ran.controls, missed, done)
         if with_feedback:  # a plan is fine that is reached in one of two ways
             missed = missed & chains.missed
         return best_of(replace(chains, missed=missed), found, np.arange(len(missed)))
 
-    def _rollouts(
-        self, chains: Chains, with_feedback: float, done: int
-    ) -> tuple[Chains, np.ndarray]:
-        """Rollouts of the chains' controls as their knots; and which miss, as in `_replayed`."""
-        knots, (ran, missed) = chains.state.trajectory, self._replayed(chains, with_feedback)
-        x, u = (jnp.asarray(a, knots.x.dtype) for a in (ran.states[:, 1:], ran.controls))
+    def _as_knots(
+        self,
+        chains: Chains,
+        states: np.ndarray,
+        controls: np.ndarray,
+        missed: np.ndarray,
+        done: int,
+    ) -> Chains:
+        """Chains whose knots are rollouts (rows, K + 1, nx) of them, some of which have missed."""
+        knots = chains.state.trajectory
+        x, u = (jnp.asarray(a, knots.x.dtype) for a in (states[:, 1:], controls))
         rolled = Trajectory(x, u, start=knots.start)
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
@@ -807,31 +817,39 @@ class Search:
         if self.family.problem.goal is not None:
             ran_to = replace(gathered(state.trajectory, self.mesh), slack=None)
             own, info = missed, self._by_the_engine(info, ran_to, ~missed)
-        return self._whole(Chains(state, info, np.full(len(x), done), own)), missed
+        return self._whole(Chains(state, info, np.full(len(x), done), own))
 
     def _rolled_out_in_part(
         self, now: Chains, whole: Chains, done: int
     ) -> tuple[Chains, np.ndarray]:
         """What a round has made of chains `now`, rolled out; or a share of it, where all is worse.
 
-        Also which share has brought an improvement, 0 for none, (rows,).
+        Also the largest share that has brought an improvement, 0 for none, (rows,).
         """
         floor = np.repeat(self.stage.floor[self.indices], self.chains)
         found, everyone = self._rolled_out(whole, 1.0, done), np.arange(len(now.missed))
         better = np.where(_improved(now, found, floor), 1.0, 0.0)
-        ends = now.state.trajectory, whole.state.trajectory
-        for share in SHARES:
-            settled = better > 0.0
-            if settled.all():
-                break
-            knots = between(self.question[1], self.question[0], *ends, share)
-            knots = replace(knots, slack=ends[1].slack)  # unused; nothing compiles again
-            state = replace(whole.state, trajectory=knots)
-            part, _ = self._rollouts(replace(whole, state=state), 1.0, done)
-            # What is settled stays: answers must not depend on neighbours in a batch
-            info = jax.tree.map(partial(jnp.where, settled, jnp.inf), part.info)
+        rest = np.flatnonzero(better == 0.0)
+        if not len(rest):
+            return found, better
+        # Shares are replayed side by side: a replay takes its time by its knots, not by its rows
+        ends, count = (now.state.trajectory, whole.state.trajectory), len(SHARES)
+        parts = [between(self.question[1], self.question[0], *ends, share) for share in SHARES]
+        plan = np.concatenate([self._plans(part)[rest] for part in parts])
+        u = np.concatenate([np.asarray(part.u)[rest] for part in parts])
+        gains = np.tile(np.asarray(whole.state.gains)[rest], (count, 1, 1, 1))
+        ran, missed = self._tracked(np.tile(rest, count), plan, u, gains)
+        states, controls = self._plans(ends[1]), np.array(ends[1].u)
+        for share, *own in zip(
+            SHARES, *(np.split(a, count) for a in (*ran[:2], missed)), strict=True
+        ):
+            states[rest], controls[rest], left_out = own[0], own[1], np.ones(len(better), bool)
+            left_out[rest] = own[2]
+            part = self._as_knots(whole, states, controls, left_out, done)
+            # What was settled stays: answers must not depend on neighbours in a batch
+            info = jax.tree.map(partial(jnp.where, better == 1.0, jnp.inf), part.info)
             part = replace(part, info=info)
-            better[_improved(now, part, floor)] = share
+            better = np.where(_improved(now, part, floor), np.maximum(better, share), better)
             found = best_of(found, part, everyone)
         return found, better
 

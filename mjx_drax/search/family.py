@@ -239,31 +239,31 @@ class Family:
         return jax.tree.unflatten(tree, own), jax.tree.unflatten(tree, shared)
 
     def replay(
-        self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+        self, of: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`Problem.replay` of those problems' plans, as many of each, problem by problem."""
+        """`Problem.replay` of plans (n, K + 1, nx) of the problems `of` (n,)."""
         if self.alone:
             return self.problem.replay(plan, u, gains)
         if not self.varies("dynamics", "bounds"):
             with self.problem.arithmetic():
                 knots = self.mapped(lambda problem: problem.knots.at(slice(-1)))
-            each = np.repeat(indices, len(u) // len(indices))
-            return self.problem.replay(plan, u, gains, knots.at(each))
-        parts = (np.split(a, len(indices)) for a in (plan, u, gains))
-        ran = [self.at(int(i)).replay(*own) for i, *own in zip(indices, *parts, strict=True)]
-        return np.concatenate([run[0] for run in ran]), np.concatenate([run[1] for run in ran])
+            return self.problem.replay(plan, u, gains, knots.at(of))
+        states, controls = np.empty(plan.shape), np.empty(u.shape)
+        for i in np.unique(of):
+            rows = of == i
+            states[rows], controls[rows] = self.at(int(i)).replay(plan[rows], u[rows], gains[rows])
+        return states, controls
 
     def tracked(
-        self, indices: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+        self, of: np.ndarray, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> Tracked:
-        """Replays with feedback, whose gains may be smaller than the given ones.
+        """Replays of the problems `of` with feedback; gains may be smaller than the given ones.
 
         A linear model of contacts holds for small changes only, and gains that trust it can make
         controls chatter between their bounds. So where f has kinks and a replay leaves its plan,
         smaller ones are tried, and the nearest replay is taken.
         """
         difference = self.at(0).dynamics.host_difference
-        of = np.repeat(indices, len(u) // len(indices))  # the problem of each row
 
         def largest(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             with np.errstate(invalid="ignore"):  # of states that are not finite

@@ -134,7 +134,7 @@ def both_ways(
         u: planned controls, (n, K, nu).
         gains: feedback, (n, K, nu, ndx); see `Family.tracked`.
     """
-    which, extent = np.arange(family.count), extents(family.at(0), plan, u)
+    which, extent = np.resize(np.arange(family.count), len(u)), extents(family.at(0), plan, u)
     open_loop = family.replay(which, plan, u, 0.0 * gains)
     found = family.tracked(which, plan, u, gains)
     feedback = judged(family, plan, extent, (found.states, found.controls), tolerances)

@@ -231,7 +231,7 @@ def test_gains_that_chatter_are_lowered_where_f_has_kinks_until_the_plan_is_trac
     gains = np.full((3, 20, 1, 1), -2.5)  # an error becomes -1.5 times itself; 0.25 with 0.3
     gains[2] = -1.0
     gentle, smooth = (
-        Family.of_one(p).tracked(np.arange(1), plan, u, gains)
+        Family.of_one(p).tracked(np.zeros(len(u), int), plan, u, gains)
         for p in (problem, from_function(lambda x, u: x + u, nu=1, dt=0.1, **along))
     )
     np.testing.assert_array_equal(gentle.gains[:, 0, 0, 0], [-0.75, -2.5, -1.0])
