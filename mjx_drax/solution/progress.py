@@ -1,13 +1,14 @@
-"""Live progress of a solve: a line while it compiles, then a bar with the numbers that matter.
+"""Live progress of a solve, on standard error.
 
-It goes to standard error, and is there by default if that is a terminal or a notebook: else it
-would fill files with lines that are out of date.
+In a terminal or a notebook it is a line while it compiles, then a bar with the numbers that matter.
+Elsewhere, as in the log of a cluster's job, it is a line a minute.
 """
 
 from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -19,6 +20,8 @@ from mjx_drax.problem.tracing import require_functions
 from mjx_drax.search.iterate import FEASIBLE
 
 COMPILING = "{desc}: compiling, first iterations [{elapsed}]"
+EVERY = 60.0
+"""Seconds between two lines of a log; a solve that takes less writes none."""
 FORMAT = "{l_bar}{bar}| {n_fmt}%s{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
 
@@ -29,9 +32,11 @@ def reporting(
 
     Args:
         progress: a function of the user's; True or False: with a `Bar` or without; None: with one
-            where somebody watches.
+            where somebody watches, and else with `Lines`.
         name: what the bar calls the problem.
     """
+    if progress is None and sys.stderr is not None and not watched():
+        return Lines(name)
     if progress is None:
         progress = watched()
     if progress is True:
@@ -53,14 +58,60 @@ def _in_notebook() -> bool:
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
-class Bar:
-    """Called as progress(done, total, info), or (done, total) for problems of a batch; a context.
+class _Report:
+    """Called as progress(done, total, info), or (done, total) for a batch's problems; a context."""
+
+    def __init__(self, name: str) -> None:
+        self._name, self._best = name, float("inf")
+
+    def _numbers(self, info: Info) -> str:
+        """The best cost so far, and how many chains are feasible."""
+        feasible = np.asarray(info.max_defect) < FEASIBLE
+        self._best = np.asarray(info.cost)[feasible].min(initial=self._best)
+        return f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
+
+
+class Lines(_Report):
+    """A line a minute, written by a thread: how far the solve is, or that it compiles."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._now, self._ended = "compiling, first iterations", threading.Event()
+
+    def __enter__(self) -> Lines:
+        self._begun = time.monotonic()
+        self._clock = threading.Thread(target=self._tick, daemon=True)
+        self._clock.start()
+        return self
+
+    def _tick(self) -> None:
+        while not self._ended.wait(EVERY):
+            minutes, seconds = divmod(int(time.monotonic() - self._begun), 60)
+            print(
+                f"{self._name}: {self._now} [{minutes}:{seconds:02}]", file=sys.stderr, flush=True
+            )
+
+    def __call__(self, done: int, total: int, info: Info | None = None) -> None:
+        """Keep how far the solve is, for the next line."""
+        if info is None:
+            self._now = f"{done}/{total}"
+        else:
+            self._now = f"iteration {done} of at most {total}, {self._numbers(info)}"
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._clock.join()
+
+
+class Bar(_Report):
+    """A line while it compiles, then a bar.
 
     The time that compiling takes is shown once a second by a thread, if somebody watches.
     """
 
     def __init__(self, name: str) -> None:
-        self._name, self._best, self._compiled = name, float("inf"), threading.Event()
+        super().__init__(name)
+        self._compiled = threading.Event()
 
     def __enter__(self) -> Bar:
         from tqdm import tqdm
@@ -89,10 +140,7 @@ class Bar:
             bar.reset(total)
             bar.initial = done
         if info is not None:
-            feasible = np.asarray(info.max_defect) < FEASIBLE
-            self._best = np.asarray(info.cost)[feasible].min(initial=self._best)
-            numbers = f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
-            bar.set_postfix_str(numbers, False)
+            bar.set_postfix_str(self._numbers(info), False)
         bar.total = total  # grows with each further attempt
         bar.update(done - bar.n)
 

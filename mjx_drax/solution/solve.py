@@ -62,7 +62,8 @@ def solve(
             horizon cuts it off, or repeats its last stage. No chain ends worse than a feasible
             guess.
         progress: True shows a bar, also while it compiles, False shows nothing; by default there is
-            one if standard error is a terminal or a notebook. A function is called instead with
+            one if standard error is a terminal or a notebook, and else a line a minute, as in the
+            log of a job. A function is called instead with
             (iterations done, of how many, diagnostics) every few iterations. Ctrl-C between two
             reports ends the solve early and keeps what there is.
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for

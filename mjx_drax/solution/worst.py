@@ -59,8 +59,13 @@ def table(solution: Results, chain: int | None = None, count: int = 10) -> str:
     chain, lines = solution.chain_or_best(chain), []
     mode = solution.mode_of(chain)
     outcome = solution.replays_in(mode).outcome(solution.problem, chain)
+    plan = of_plan(solution, chain)
+    of = f"plan of chain {chain}"
+    if solution.feasible[chain] and any(v.kind == DYNAMICS and v.broken for v in plan):
+        of += f", feasible as JAX computes f (max|h| {solution.max_defect[chain]:.1e})"
+        of += ", not as the replaying engine does"
     for title, found in (
-        (f"plan of chain {chain}", of_plan(solution, chain)),
+        (of, plan),
         (f"replay {mode} of chain {chain}, which {outcome}", of_replay(solution, chain)),
     ):
         broken, shown = sum(v.broken for v in found), [v for v in found if v.size][:count]

@@ -29,7 +29,7 @@ _MARGIN = 1.1  # factor on the free camera's distance
 _ROOM = 2.0  # the same for one that follows, so that one sees where the robot goes
 _AROUND = 1.3  # the free camera's distance grows at most so much to see what stands still
 _FAR = 8.0  # a robot travels far if its way is so many times its size
-_SUN = np.array([0.4, 0.5, -1.0])  # where light comes from in a model without lights: its direction
+_SUN = np.array([0.4, 0.5, -1.0])  # direction of the light of models without a directional one
 _RED = np.array([0.85, 0.15, 0.1, 1.0])
 _GROUPS = 3  # geoms of the groups 0, 1 and 2 are drawn
 _POSES = 240  # so many poses of a motion decide where the free camera stands
@@ -54,17 +54,18 @@ class Scene:
         mujoco.mjv_updateScene(
             self._model, self.data, self._option, None, self._camera, kind.value, self.content
         )
-        if self._model.nlight == 0:
+        if not (self._model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value).any():
             self._add_sun()
 
     def _add_sun(self) -> None:
-        """Light from above, for models that bring none but the camera's own."""
+        """A directional light, weaker beside spotlights, which leave most of a floor dark."""
         light = self.content.lights[self.content.nlight]
         light.headlight, light.castshadow = 0, 1
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
         light.dir[:] = _SUN / np.linalg.norm(_SUN)
         light.pos[:] = -10.0 * _SUN * max(float(self._model.stat.extent), 1.0)
-        light.ambient[:], light.diffuse[:], light.specular[:] = 0.1, 0.5, 0.1
+        strength = 0.3 if self._model.nlight else 0.5
+        light.ambient[:], light.diffuse[:], light.specular[:] = 0.1, strength, 0.1
         self.content.nlight += 1
 
     def add_arrows(self, arrows: Sequence[Arrow]) -> None:
@@ -155,8 +156,8 @@ def camera_for(
 ) -> mujoco.MjvCamera:
     """The camera asked for, for a motion qpos (T, nq) in frames of an aspect, width / height.
 
-    `wanted` is a camera's name or index, `FREE` or `FOLLOW`; None is `FREE`, or `FOLLOW` where the
-    robot travels far.
+    `wanted` is a camera's name or index, `FREE` or `FOLLOW`; None is `FREE`, or `FOLLOW` where a
+    robot travels far that actuators drive.
 
     Raises:
       DraxError: there is no such camera.
@@ -180,9 +181,9 @@ def camera_for(
 
 
 def _travels_far(model: mujoco.MjModel, qpos: Floats) -> bool:
-    """Whether a body that moves in the plane or in space goes far, beside its size."""
+    """Whether a robot that moves in the plane or in space goes far, beside its size."""
     body = travelling_body(model)
-    if body is None:
+    if body is None or (model.nu and not _is_driven(model, body, qpos[0])):
         return False
     way = np.ptp(body_positions(model, body, qpos), axis=0).max()
     own = model.body_rootid[model.geom_bodyid] == model.body_rootid[body]
@@ -192,6 +193,17 @@ def _travels_far(model: mujoco.MjModel, qpos: Floats) -> bool:
         return False
     size = np.max(np.ptp(places, axis=0) + 2.0 * bound.max())
     return bool(way > _FAR * size)
+
+
+def _is_driven(model: mujoco.MjModel, body: int, qpos: Floats) -> bool:
+    """Whether actuators act on the tree of a body; on that of a ball that is thrown, none do."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    entries = zip(data.moment_rowadr, data.moment_rownnz, strict=True)
+    dofs = [dof for first, count in entries for dof in data.moment_colind[first : first + count]]
+    roots = model.body_rootid[model.dof_bodyid[dofs]] if dofs else []
+    return bool(model.body_rootid[body] in roots)
 
 
 def _free_camera(

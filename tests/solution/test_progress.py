@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from builders import point
 
 from mjx_drax import Restarts, solve
 from mjx_drax.solution import progress
-from mjx_drax.solution.progress import Bar, reporting, watched
+from mjx_drax.solution.progress import Bar, Lines, reporting, watched
 
 INFO = SimpleNamespace(
     max_defect=np.array([1.0, 0.0, np.nan, 1e-5]), cost=np.array([1.0, 5.0, 2.0, 7.0])
@@ -31,7 +32,7 @@ def test_a_terminal_and_a_notebook_are_watched_a_pipe_is_not(monkeypatch):
     assert not watched()
 
 
-@pytest.mark.parametrize(("somebody", "kind"), [(True, Bar), (False, type(None))])
+@pytest.mark.parametrize(("somebody", "kind"), [(True, Bar), (False, Lines)])
 def test_by_default_there_is_a_bar_if_somebody_watches(monkeypatch, capsys, somebody, kind):
     monkeypatch.setattr(progress, "watched", lambda: somebody)
     for given, shown in ((None, kind), (True, Bar), (False, type(None))):
@@ -79,8 +80,31 @@ def test_a_batch_counts_problems(capsys):
     assert "100%|██████████| 9/9 [" in capsys.readouterr().err
 
 
+def test_a_log_gets_lines_while_it_compiles_and_with_the_best_cost_after(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "EVERY", 0.01)
+
+    def next_line():
+        shown, deadline = "", time.monotonic() + 10
+        while not shown and time.monotonic() < deadline:
+            time.sleep(0.01)
+            shown = capsys.readouterr().err
+        return shown.splitlines()[-1]
+
+    with Lines("arm") as report:
+        assert next_line() == "arm: compiling, first iterations [0:00]"
+        report(20, 100, INFO)
+        capsys.readouterr()
+        assert next_line() == "arm: iteration 20 of at most 100, best cost 5, feasible 50% [0:00]"
+        report(3, 9)
+        capsys.readouterr()
+        assert next_line() == "arm: 3/9 [0:00]"
+    capsys.readouterr()
+    time.sleep(0.05)
+    assert capsys.readouterr().err == ""  # ended
+
+
 @pytest.mark.slow
-def test_solve_shows_a_bar_if_asked_and_is_silent_in_a_pipe(capsys):
+def test_solve_shows_a_bar_if_asked_and_a_short_one_is_silent_in_a_pipe(capsys):
     once = Restarts(descent=5, attempts=1)
     solve(point(), chains=2, solver=once)
     assert capsys.readouterr() == ("", "")

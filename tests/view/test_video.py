@@ -22,7 +22,7 @@ from mjx_drax.physics.states import interpolated
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view import renderer, video
 from mjx_drax.view.frames import DARK, caption_height
-from mjx_drax.view.scene import camera_for
+from mjx_drax.view.scene import Scene, camera_for
 
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 120, 160
@@ -183,6 +183,38 @@ def test_the_camera_goes_with_a_robot_that_travels_far(way: float, follows: bool
     seen = camera_for(model, qpos, None, 4 / 3)
     kinds = mujoco.mjtCamera.mjCAMERA_FREE, mujoco.mjtCamera.mjCAMERA_TRACKING
     assert seen.type == kinds[follows]
+
+
+@pytest.mark.parametrize(("actuators", "follows"), [("hit", False), ("fly", True)])
+def test_the_camera_does_not_go_with_a_ball_that_is_hit(actuators: str, follows: bool) -> None:
+    """What no actuator drives is no robot; a site's actuator drives the body that it is on."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody>
+        <body><joint name="bat"/><geom size=".1"/></body>
+        <body pos="0 0 1"><freejoint/><geom size=".1"/><site name="rotor"/></body>
+        </worldbody><actuator><motor {"joint='bat'" if actuators == "hit" else "site='rotor'"}/>
+        </actuator></mujoco>"""
+    )
+    qpos = np.array([[0.0, x, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0] for x in np.linspace(0.0, 9.0, 5)])
+    kinds = mujoco.mjtCamera.mjCAMERA_FREE, mujoco.mjtCamera.mjCAMERA_TRACKING
+    assert camera_for(model, qpos, None, 4 / 3).type == kinds[follows]
+
+
+@pytest.mark.parametrize(
+    ("lights", "strengths"),
+    [("", [0.5]), ("<light/>", [0.3]), ("<light/><light type='directional'/>", [0.7])],
+)
+def test_every_floor_has_a_directional_light(lights: str, strengths: list[float]) -> None:
+    """0.7 is MuJoCo's own default: a model's directional light is not touched."""
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{lights}</worldbody></mujoco>")
+    scene = Scene(model, mujoco.MjvCamera())
+    scene.begin(None)
+    shining = [
+        light for light in scene.content.lights[: scene.content.nlight] if not light.headlight
+    ]
+    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
+    found = [light.diffuse[0] for light in shining if light.type == directional]
+    np.testing.assert_allclose(found, strengths)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "acrobot", "cartpole"])
