@@ -784,7 +784,7 @@ class Search:
         return self._tracked(slice(None), self._plans(knots), np.asarray(knots.u), gains)
 
     def _tracked(
-        self, rows: Any, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+        self, rows: np.ndarray | slice, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> tuple[Tracked, np.ndarray]:
         """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
         family, of = self.family, np.repeat(self.indices, self.chains)
@@ -839,13 +839,12 @@ class Search:
         u = np.concatenate([np.asarray(part.u)[rest] for part in parts])
         gains = np.tile(np.asarray(whole.state.gains)[rest], (count, 1, 1, 1))
         ran, missed = self._tracked(np.tile(rest, count), plan, u, gains)
-        states, controls = self._plans(ends[1]), np.array(ends[1].u)
-        for share, *own in zip(
-            SHARES, *(np.split(a, count) for a in (*ran[:2], missed)), strict=True
-        ):
-            states[rest], controls[rest], left_out = own[0], own[1], np.ones(len(better), bool)
-            left_out[rest] = own[2]
-            part = self._as_knots(whole, states, controls, left_out, done)
+        of_shares = (np.split(a, count) for a in (ran.states, ran.controls, missed))
+        for share, *of_share in zip(SHARES, *of_shares, strict=True):
+            replays = self._plans(ends[1]), np.array(ends[1].u), np.ones(len(better), bool)
+            for of_all, of_rest in zip(replays, of_share, strict=True):
+                of_all[rest] = of_rest
+            part = self._as_knots(whole, *replays, done)
             # What was settled stays: answers must not depend on neighbours in a batch
             info = jax.tree.map(partial(jnp.where, better == 1.0, jnp.inf), part.info)
             part = replace(part, info=info)
