@@ -8,6 +8,7 @@ from html import escape
 
 import numpy as np
 
+from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
@@ -135,12 +136,16 @@ def optima_lines(solution: Results) -> list[str]:
 
 
 def _apart(solution: Results, first: Optimum, other: Optimum) -> str:
-    """Which coordinate of a plan differs most from the first's, by the range it has in both."""
-    dynamics = solution.problem.dynamics
+    """Which coordinate of a plan differs most from the first's, by the range it has in both.
+
+    A range is at least what a feasible plan may be off: a ball that flies straight has one of
+    rounding's size to its side.
+    """
+    dynamics, least = solution.problem.dynamics, FEASIBLE * np.asarray(solution.problem.unit)
     here, there = (np.asarray(optimum.trajectory.x) for optimum in (first, other))
     off = dynamics.host_difference(there, here)
     both = dynamics.host_difference(np.concatenate([here, there]), here[:1])
-    widths = np.maximum(np.ptp(both, axis=0), np.finfo(both.dtype).tiny)
+    widths = np.maximum(np.ptp(both, axis=0), least)
     k, i = np.unravel_index(np.argmax(np.abs(off) / widths), off.shape)
     return f"{difference_names(dynamics)[i]} by {off[k, i]:+.3g} at knot {k + 1}"
 

@@ -289,6 +289,20 @@ def test_table_tells_cost_share_replays_and_what_differs(hill):
     assert optima_lines(lost)[1].split()[3] == "feedback"
 
 
+def test_what_moves_by_rounding_only_is_not_what_differs(hill):
+    def with_last(optimum, value):
+        x = np.array(optimum.trajectory.x)
+        x[:, 3] = value
+        return replace(optimum, trajectory=replace(optimum.trajectory, x=x))
+
+    still = replace(hill)
+    first, second = hill.optima[:2]
+    still.__dict__["optima"] = [with_last(first, 0.0), with_last(second, 1e-8)]
+    assert " x3 by " not in optima_lines(still)[-1]
+    still.__dict__["optima"] = [with_last(first, 0.0), with_last(second, 1e4)]
+    assert " x3 by +1e+04 " in optima_lines(still)[-1]
+
+
 @pytest.mark.slow
 def test_pictures_side_by_side_and_over_each_other(hill, tmp_path, monkeypatch):
     seen = []
