@@ -33,15 +33,13 @@ def reporting(
     Args:
         progress: a function of the user's; True or False: with a `Bar` or without; None: with one
             where somebody watches, and else with `Lines`.
-        name: what the bar calls the problem.
+        name: what they call the problem.
     """
-    if progress is None and sys.stderr is not None and not watched():
-        return Lines(name)
-    if progress is None:
-        progress = watched()
+    if progress is None and sys.stderr is not None:
+        return Bar(name) if watched() else Lines(name)
     if progress is True:
         return Bar(name)
-    if progress is False:
+    if progress is None or progress is False:
         return nullcontext()
     require_functions(progress=progress)
     return nullcontext(progress)
@@ -58,7 +56,7 @@ def _in_notebook() -> bool:
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
-class _Report:
+class _Progress:
     """Called as progress(done, total, info), or (done, total) for a batch's problems; a context."""
 
     def __init__(self, name: str) -> None:
@@ -71,7 +69,7 @@ class _Report:
         return f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
 
 
-class Lines(_Report):
+class Lines(_Progress):
     """A line a minute, written by a thread: how far the solve is, or that it compiles."""
 
     def __init__(self, name: str) -> None:
@@ -103,7 +101,7 @@ class Lines(_Report):
         self._clock.join()
 
 
-class Bar(_Report):
+class Bar(_Progress):
     """A line while it compiles, then a bar.
 
     The time that compiling takes is shown once a second by a thread, if somebody watches.

@@ -63,9 +63,9 @@ def solve(
             guess.
         progress: True shows a bar, also while it compiles, False shows nothing; by default there is
             one if standard error is a terminal or a notebook, and else a line a minute, as in the
-            log of a job. A function is called instead with
-            (iterations done, of how many, diagnostics) every few iterations. Ctrl-C between two
-            reports ends the solve early and keeps what there is.
+            log of a job. A function is called instead with (iterations done, of how many,
+            diagnostics) every few iterations. Ctrl-C between two reports ends the solve early and
+            keeps what there is.
         record: keep the knots of all chains every so many iterations, in `solution.recording`, for
             `render_diffusion`; the answer is the same. It takes 4 (nx + 1) K bytes for each chain
             and snapshot, and at most `recording.LIMIT`, beyond which fewer snapshots are kept.
