@@ -29,8 +29,8 @@ FROM_ROOMS = (
     "view.plotting.plot_optima",
     "view.phase_plots.plot_phase",
     "view.phase_plots.plot_multipliers",
-    "view.viewer.show",
-    "view.viewer.live_page",
+    "view.browser.viewer.show",
+    "view.browser.viewer.live_page",
 )
 WORKER = """\
 // Browsers refuse workers to pages from disk. There the search runs in a hidden frame.

@@ -50,7 +50,7 @@ from .solution.solution import Solution as Solution
 from .solution.solve import solve as solve
 from .solution.violations import Tolerances as Tolerances
 from .studies.lbfgs import LBFGS as LBFGS
-from .view.browser import save_html as save_html
+from .view.browser.page import save_html as save_html
 from .view.diffusion import render_diffusion as render_diffusion
 from .view.plotting import plot_solution as plot_solution
 from .view.timelapse import render_timelapse as render_timelapse

@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     if options.suite is None:
         for name in options.tasks:
             tasks.full_name(name)  # answers at once, before heavy imports
-    from mjx_drax.solution.save import writable
+    from mjx_drax.solution.files.save import writable
     from mjx_drax.studies import benchmark
     from mjx_drax.studies.convergence import suite
 

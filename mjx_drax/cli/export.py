@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
     if not wanted:
         flags = ", ".join(f"--{name}" for name in exporters())
         raise DraxError(f"nothing to write: give at least one of {flags} or --export.")
-    from mjx_drax.solution.save import writable
+    from mjx_drax.solution.files.save import writable
     from mjx_drax.solution.solution import Solution
 
     solution = Solution.load(options.folder)

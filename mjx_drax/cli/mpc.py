@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.control import trials as runs
     from mjx_drax.control.mpc import MPC
     from mjx_drax.control.plant import Plant
-    from mjx_drax.solution.save import writable
+    from mjx_drax.solution.files.save import writable
     from mjx_drax.view.video import check as require_drawing
 
     problem = make(tasks.load(options.task), options.horizon)

@@ -149,7 +149,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     """The same, in the precision that JAX has now; `stack` closes what it opens."""
     problem, solver, chains, draw = _asked(options)
     from mjx_drax.search.restarts import settled
-    from mjx_drax.solution import save as results
+    from mjx_drax.solution.files import save as results
     from mjx_drax.solution.solve import solve
     from mjx_drax.view.video import check as require_drawing
 
@@ -174,7 +174,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     tell = say_nothing if options.quiet or options.json else say
     record: Any = 1 if film else None
     if options.live is not None:
-        from mjx_drax.view.viewer import live_page
+        from mjx_drax.view.browser.viewer import live_page
 
         page = live_page(problem, port=options.live, every=record or 5, told=tell)
         record = stack.enter_context(page)

@@ -31,8 +31,8 @@ def run(options: argparse.Namespace) -> int:
     """Show the result until Ctrl-C, or until the window is closed."""
     from mjx_drax.physics.dynamics import mujoco_model
     from mjx_drax.solution.solution import Solution
-    from mjx_drax.view.picture_page import show_pictures
-    from mjx_drax.view.viewer import show, show_natively
+    from mjx_drax.view.browser.pictures import show_pictures
+    from mjx_drax.view.browser.viewer import show, show_natively
 
     solution = Solution.load(options.folder)
     if options.native:

@@ -13,10 +13,10 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxError, is_number, require_not_negative, require_positive, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.physics.c_engine.states import Floats, converged, integrate, set_state
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import index
-from mjx_drax.physics.states import Floats, converged, integrate, set_state
 from mjx_drax.problem.problem import Problem
 
 LASTS = 0.1

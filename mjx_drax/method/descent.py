@@ -153,8 +153,3 @@ def adapted(
     factor = jnp.where(alpha >= 1.0, LESS_DAMPING, short)
     damping = jnp.clip(factor * old.damping, *DAMPING_RANGE)
     return replace(new, multipliers=replace(new.multipliers, bounds=v), damping=damping)
-
-
-def with_damping(weights: Weights, factor: Array) -> Weights:
-    """The weights with a chain's own damping."""
-    return replace(weights, damping=factor * weights.damping)

@@ -231,7 +231,7 @@ class Langevin:
     ) -> Model:
         """The model at the chain's knots. Bounds have multipliers of their own in the tail."""
         present = state.multipliers if tail else replace(state.multipliers, bounds=None)
-        damped = descent.with_damping(weights, state.damping)
+        damped = replace(weights, damping=state.damping * weights.damping)
         by, key_model = self.preconditioner.derivatives, jax.random.split(key)[0]
         return expand(problem, self.bounds, state.trajectory, present, damped, by, key_model)
 

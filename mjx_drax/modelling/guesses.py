@@ -29,11 +29,11 @@ from mjx_drax.base.errors import (
 )
 from mjx_drax.base.numbers import numbers
 from mjx_drax.physics.actuators import inverse_dynamics, middle_control
+from mjx_drax.physics.c_engine.states import between, interpolated, moved
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import BALL, FREE
 from mjx_drax.physics.source import index
-from mjx_drax.physics.states import between, interpolated, moved
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 

@@ -14,11 +14,11 @@ from mjx_drax.base.errors import DraxError
 from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.actuators import control_ranges
 from mjx_drax.physics.agreement.checks import checked_start
+from mjx_drax.physics.c_engine.states import Engine, between
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjcf import from_mjcf, steps_between_knots
 from mjx_drax.physics.mjx_model import free_ranges
 from mjx_drax.physics.source import load, model_name
-from mjx_drax.physics.states import Engine, between
 from mjx_drax.problem.problem import Problem
 
 TOLERANCE = 0.02

@@ -6,8 +6,8 @@ import copy
 
 import numpy as np
 
+from mjx_drax.physics.c_engine.states import quiet, set_state
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import quiet, set_state
 from mjx_drax.problem.trajectory import Box
 
 

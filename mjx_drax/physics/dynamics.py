@@ -22,9 +22,11 @@ from jax import Array
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import HostOnly
-from mjx_drax.kernels.scalarize import scalarized
+from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
+from mjx_drax.physics.c_engine.states import difference, integrate, set_state
+from mjx_drax.physics.c_engine.stepper import Stepper
 from mjx_drax.physics.contacts.collision import left_out
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
 from mjx_drax.physics.contacts.pairs import left_out as pairs_left_out
@@ -33,8 +35,6 @@ from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
 from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.source import Source, binary, model_name
-from mjx_drax.physics.states import difference, integrate, set_state
-from mjx_drax.physics.stepper import Stepper
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.extended import Extended

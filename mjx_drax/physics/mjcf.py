@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from mjx_drax.base.errors import DraxError, DraxWarning, require_part, require_positive, shown
 from mjx_drax.physics.actuators import inverse_dynamics, middle_control
 from mjx_drax.physics.agreement.checks import checked_start, examine, require_traceable
+from mjx_drax.physics.c_engine.states import stopped_at_once
 from mjx_drax.physics.contacts.pairs import Contacts
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
@@ -24,7 +25,6 @@ from mjx_drax.physics.mjx_model import free_ranges, kept_contacts, put_model
 from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.near import affordable
 from mjx_drax.physics.source import load, model_name, origin_of
-from mjx_drax.physics.states import stopped_at_once
 from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
 from mjx_drax.problem.choices import Choices, parameter_ends, phases_of
 from mjx_drax.problem.differentiators import Differentiator

@@ -8,10 +8,10 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.agreement.checks import samples
+from mjx_drax.physics.c_engine.states import Engine, quiet, set_state
 from mjx_drax.physics.contacts.collision import BOX, MESH
 from mjx_drax.physics.contacts.pairs import Contacts, Pair, contact_pairs, geom_name
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import Engine, quiet, set_state
 
 MOST_WORK = 2_000_000
 """Pairs of corners of hulls that a step may compare: MJX compares every edge with every other."""

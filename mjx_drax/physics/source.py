@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, cut, shown
+from mjx_drax.physics.c_engine.states import quiet
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.motors import Actuators, add_motors
-from mjx_drax.physics.states import quiet
 
 _FOLDER_OF = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
 

@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.kernels.linalg import symmetric
 from mjx_drax.kernels.pruning import pruned
-from mjx_drax.kernels.scalarize import scalarized
+from mjx_drax.kernels.scalars.scalarize import scalarized
 
 Function = Callable[[Array], Array]
 

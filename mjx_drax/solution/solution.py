@@ -12,10 +12,10 @@ from mjx_drax.base.errors import require_whole
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.solution import report, worst
-from mjx_drax.solution.load import load
+from mjx_drax.solution.files.load import load
+from mjx_drax.solution.files.save import save
 from mjx_drax.solution.replay import both_ways
 from mjx_drax.solution.results import Results
-from mjx_drax.solution.save import save
 from mjx_drax.solution.violations import Tolerances, as_tolerances
 
 

@@ -23,9 +23,9 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole
+from mjx_drax.physics.c_engine.states import between, finite, interpolated, moved
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import between, finite, interpolated, moved
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.recording import Path as ChainHistory
 from mjx_drax.solution.solution import Solution

@@ -24,13 +24,13 @@ class Html(Exporter):
 
     def check(self, problem: Problem) -> None:
         """Complain about a problem without a model, or if viser is not installed."""
-        from mjx_drax.view.browser_scene import require_viewer
+        from mjx_drax.view.browser.scene import require_viewer
 
         require_viewer(problem)
 
     def write(self, solution: Solution, path: Path) -> None:
         """Write the page; see `browser.save_html`."""
-        from mjx_drax.view.browser import save_html
+        from mjx_drax.view.browser.page import save_html
 
         save_html(solution, path)
 

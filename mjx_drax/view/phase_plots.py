@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from mjx_drax.base.errors import DraxError
+from mjx_drax.physics.c_engine.states import between, finite
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import between, finite
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.geoms import Floats

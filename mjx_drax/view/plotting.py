@@ -26,7 +26,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete, file_path
-from mjx_drax.physics.states import finite
+from mjx_drax.physics.c_engine.states import finite
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.log import residuals
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK

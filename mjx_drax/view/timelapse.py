@@ -9,8 +9,8 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.base.files import complete, file_path
+from mjx_drax.physics.c_engine.states import interpolated
 from mjx_drax.physics.dynamics import mujoco_model
-from mjx_drax.physics.states import interpolated
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.drawing import Canvas, Draw
 from mjx_drax.view.frames import even_size

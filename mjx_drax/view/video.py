@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mjx_drax.base.errors import DraxError, require_positive, shown
+from mjx_drax.physics.c_engine.states import finite, interpolated
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import finite, interpolated
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.results import optimality
 from mjx_drax.solution.solution import Solution

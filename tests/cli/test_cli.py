@@ -277,7 +277,7 @@ def test_view_shows_the_pictures_of_a_problem_without_a_model(tmp_path, capsys, 
         (folder / name).touch()
     seen = []
     monkeypatch.setattr(
-        "mjx_drax.view.picture_page.show_pictures", lambda _, files, **__: seen.extend(files)
+        "mjx_drax.view.browser.pictures.show_pictures", lambda _, files, **__: seen.extend(files)
     )
     assert main(["view", str(folder)]) == 0
     assert [path.name for path in seen] == ["video.mp4", "plot.png"]

@@ -27,7 +27,7 @@ from mjx_drax.control import mpc
 from mjx_drax.control import trials as loop
 from mjx_drax.control.plant import random_pushes
 from mjx_drax.control.shift import shifted
-from mjx_drax.physics.states import CONVERGED
+from mjx_drax.physics.c_engine.states import CONVERGED
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import advance, start
 

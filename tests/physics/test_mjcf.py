@@ -15,9 +15,9 @@ from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.model import linearize
 from mjx_drax.models import path
 from mjx_drax.physics import step as physics
+from mjx_drax.physics.c_engine.states import difference, set_state
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.report import check
-from mjx_drax.physics.states import difference, set_state
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.search.iterate import evaluate
 

@@ -13,6 +13,8 @@ from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.actuators import driven
 from mjx_drax.physics.agreement.checks import Samples, compare, examine
 from mjx_drax.physics.agreement.differences import differences, set_aside
+from mjx_drax.physics.c_engine.states import Engine
+from mjx_drax.physics.c_engine.stepper import Stepper
 from mjx_drax.physics.contacts.pairs import contact_pairs
 from mjx_drax.physics.mjx_model import (
     MOST_CONTACTS,
@@ -23,9 +25,7 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.observed import Observed
-from mjx_drax.physics.states import Engine
 from mjx_drax.physics.step import data_at, forward, step
-from mjx_drax.physics.stepper import Stepper
 
 CHAIN = """
 <mujoco model="chain">

@@ -16,7 +16,7 @@ from mjx_drax import Autodiff, Smoothed, from_mjcf
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.model import linearize
 from mjx_drax.physics.agreement.checks import Samples, compare
-from mjx_drax.physics.states import Engine, difference, moved
+from mjx_drax.physics.c_engine.states import Engine, difference, moved
 from mjx_drax.problem.trajectory import Trajectory
 
 SWINGING = """

@@ -8,7 +8,7 @@ import pytest
 from builders import INF, NAN, point
 
 from mjx_drax import Restarts, Solution, from_program, minimize, solve
-from mjx_drax.solution import save as results
+from mjx_drax.solution.files import save as results
 from mjx_drax.solution.log import residuals, table
 
 HISTORY = {

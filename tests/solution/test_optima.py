@@ -14,7 +14,7 @@ from mjx_drax.cli import main
 from mjx_drax.problem.cost import as_partial
 from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.solution import optima
-from mjx_drax.solution import save as results
+from mjx_drax.solution.files import save as results
 from mjx_drax.solution.optima import TOLERANCE, cluster
 from mjx_drax.solution.report import optima_lines
 from mjx_drax.solution.results import distinct

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.physics.states import interpolated
+from mjx_drax.physics.c_engine.states import interpolated
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view import renderer, video
 from mjx_drax.view.frames import DARK, caption_height

@@ -28,12 +28,12 @@ from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.actuators import control_ranges, disabled
 from mjx_drax.physics.agreement.differences import PARTS, Change, differences, disabling, set_aside
+from mjx_drax.physics.c_engine.states import Engine, integrate, quiet, set_state, stopped_at_once
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, put_model
 from mjx_drax.physics.source import binary
-from mjx_drax.physics.states import Engine, integrate, quiet, set_state, stopped_at_once
 
 SINGULAR = 1e-10
 """Least eigenvalue of the inertia, scaled to a diagonal of ones, that can be divided by."""

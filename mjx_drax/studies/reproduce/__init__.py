@@ -41,7 +41,7 @@ def run(
     """
     from mjx_drax.base.files import write_json
     from mjx_drax.search.settings import to_data
-    from mjx_drax.solution.save import writable
+    from mjx_drax.solution.files.save import writable
     from mjx_drax.studies.measurements import machine
     from mjx_drax.view.plotting import save_figure
 

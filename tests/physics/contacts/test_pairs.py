@@ -11,10 +11,10 @@ from mjx_drax import DraxError
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics import near
 from mjx_drax.physics.agreement.checks import Samples, compare, examine
+from mjx_drax.physics.c_engine.states import Engine
 from mjx_drax.physics.contacts.pairs import contact_pairs, left_out
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.mjx_model import contact_points, put_model
-from mjx_drax.physics.states import Engine
 
 XML = """
 <mujoco model="walker">

@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from mjx_drax.physics.c_engine.states import Floats, converged, quiet
 from mjx_drax.physics.engine import Rollout, mujoco
-from mjx_drax.physics.states import Floats, converged, quiet
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays. Threads wait for each other at every knot, which takes longer than

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, save_html
+from mjx_drax.physics.c_engine.states import set_state
 from mjx_drax.physics.dynamics import mujoco_model
-from mjx_drax.physics.states import set_state
 from mjx_drax.tasks import load
 from mjx_drax.view.exporters import Html
 

@@ -1,6 +1,6 @@
 """A replay in the browser: one HTML file with everything in it, which opens from disk.
 
-viser records the scene, see `browser_scene`. The page has a bar to move along time, and a scene
+viser records the scene, see `scene`. The page has a bar to move along time, and a scene
 tree, in which these parts are shown and hidden:
 
     world    what does not move
@@ -22,7 +22,7 @@ import numpy as np
 from mjx_drax.base.errors import require_whole
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.solution.solution import Solution
-from mjx_drax.view.browser_scene import ReplayScene, require_viewer, server_at
+from mjx_drax.view.browser.scene import ReplayScene, require_viewer, server_at
 from mjx_drax.view.video import outcome_lines
 
 GHOSTS = 8

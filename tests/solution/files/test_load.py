@@ -22,7 +22,7 @@ from mjx_drax import (
     solve,
 )
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.solution import save as results
+from mjx_drax.solution.files import save as results
 from mjx_drax.view.plotting import plot_solution
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax.kernels.scalar_kernel import THREADS, at_all_rows, vmapped_as_kernel
+from mjx_drax.kernels.scalars.kernel import THREADS, at_all_rows, vmapped_as_kernel
 
 RNG = np.random.default_rng(0)
 

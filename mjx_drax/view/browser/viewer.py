@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, require_whole
+from mjx_drax.physics.c_engine.states import finite, interpolated, set_state
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import finite, interpolated, set_state
 from mjx_drax.search.iterate import ranking
 from mjx_drax.search.recording import Recorder
-from mjx_drax.view.browser import GHOSTS
-from mjx_drax.view.browser_scene import (
+from mjx_drax.view.browser.page import GHOSTS
+from mjx_drax.view.browser.scene import (
     Ghost,
     ReplayScene,
     add_ghosts,

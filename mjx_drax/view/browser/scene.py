@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import require
+from mjx_drax.physics.c_engine.states import finite, set_state
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.states import finite, set_state
 from mjx_drax.solution.replay import OPEN_LOOP
 from mjx_drax.view.geoms import Floats, Surface, mean_color, surface_of
 from mjx_drax.view.scene import FREE, Scene, camera_for, posed

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.solution.solution import Solution
+from mjx_drax.view.browser.viewer import PORT, checked_port
 from mjx_drax.view.video import outcome_lines
-from mjx_drax.view.viewer import PORT, checked_port
 
 _PAGE = """<!doctype html><meta charset="utf-8"><title>{name}</title>
 <link rel="icon" href="data:,"><style>

@@ -1,6 +1,6 @@
 """Rules of operations on arrays of scalars: what moves entries about, and what unrolls.
 
-Arrays are those of `scalar_arithmetic`. Operations that only move entries (reshape, gather,
+Arrays are those of `arithmetic`. Operations that only move entries (reshape, gather,
 concatenate, ...) happen here and now, to arrays of numbers and of objects alike; sums, products and
 factorizations become operations of their entries.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from mjx_drax.kernels import small_matrices
-from mjx_drax.kernels.scalar_arithmetic import (
+from mjx_drax.kernels.scalars.arithmetic import (
     Arithmetic,
     Scalar,
     Unsupported,

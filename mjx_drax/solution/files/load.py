@@ -44,9 +44,9 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.search.settings import from_data
+from mjx_drax.solution.files.save import ARRAYS, CHAIN, FORMAT, SUMMARY, json_digest
 from mjx_drax.solution.replay import Replays
 from mjx_drax.solution.results import Results
-from mjx_drax.solution.save import ARRAYS, CHAIN, FORMAT, SUMMARY, json_digest
 from mjx_drax.solution.violations import KINDS, Tolerances, Violations
 
 Arrays = dict[str, np.ndarray]

@@ -8,7 +8,7 @@ import pytest
 from builders import made_up, point
 
 from mjx_drax import DraxError
-from mjx_drax.view.picture_page import show_pictures
+from mjx_drax.view.browser.pictures import show_pictures
 
 
 def test_all_is_on_one_page(tmp_path):

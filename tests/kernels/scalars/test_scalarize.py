@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from jax import lax
 
-from mjx_drax.kernels import scalarize
 from mjx_drax.kernels.pruning import pruned
-from mjx_drax.kernels.scalar_arithmetic import IN_KERNELS
-from mjx_drax.kernels.scalarize import scalarized
+from mjx_drax.kernels.scalars import scalarize
+from mjx_drax.kernels.scalars.arithmetic import IN_KERNELS
+from mjx_drax.kernels.scalars.scalarize import scalarized
 
 RNG = np.random.default_rng(0)
 A = RNG.uniform(0.5, 2.0, (3, 4))

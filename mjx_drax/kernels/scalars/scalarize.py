@@ -5,7 +5,7 @@ operations: slices, gathers, products of 3x3 matrices. Under `vmap` over knots a
 them moves memory. `scalarized(f)` traces f once and evaluates its jaxpr with every array held as a
 numpy array of scalars, each a known number or a traced scalar. What moves numbers about (reshape,
 gather, concatenate, ...) then happens here, at trace time; what computes is simplified and done
-scalar by scalar (`scalar_arithmetic`). The result is elementwise code, which fuses.
+scalar by scalar (`arithmetic`). The result is elementwise code, which fuses.
 
 Of the simplifications 0 x = 0, 0 / x = 0 and x - x = 0 hold for finite x only: where x is infinite
 or NaN, the scalarized function returns the 0, not NaN; and x + 0 keeps the sign of x = -0. What is
@@ -28,7 +28,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
 from mjx_drax.kernels.batching import of_one_precision, on_gpu
 from mjx_drax.kernels.pruning import needed_program, without_unused
-from mjx_drax.kernels.scalar_arithmetic import (
+from mjx_drax.kernels.scalars.arithmetic import (
     ELEMENTWISE,
     IN_KERNELS,
     NUMPY,
@@ -45,8 +45,8 @@ from mjx_drax.kernels.scalar_arithmetic import (
     is_numeric,
     key_of,
 )
-from mjx_drax.kernels.scalar_kernel import vmapped_as_kernel
-from mjx_drax.kernels.scalarize_rules import MOVES, UNROLLED, known_integers
+from mjx_drax.kernels.scalars.kernel import vmapped_as_kernel
+from mjx_drax.kernels.scalars.rules import MOVES, UNROLLED, known_integers
 
 LIMIT = 8_000
 """Scalar operations of a function, above which it is left as it is: XLA would compile for longer

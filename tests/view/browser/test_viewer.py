@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError, solve, tasks
-from mjx_drax.view.browser_scene import contact_forces
-from mjx_drax.view.viewer import live_page, show, show_natively
+from mjx_drax.view.browser.scene import contact_forces
+from mjx_drax.view.browser.viewer import live_page, show, show_natively
 
 BALL = """
 <mujoco><worldbody>
