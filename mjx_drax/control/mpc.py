@@ -71,7 +71,8 @@ from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.trajectory import Knot
-from mjx_drax.search.engine import Chains, Search
+from mjx_drax.search.chains import Chains
+from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import (
     FEASIBLE,

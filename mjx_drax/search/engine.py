@@ -21,10 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh
-from jax.typing import ArrayLike
 
 from mjx_drax.base.digests import digest
-from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
@@ -39,25 +37,33 @@ from mjx_drax.search.attempts import (
     stricter,
     temperature,
 )
+from mjx_drax.search.chains import (
+    CHEAPER,
+    Chains,
+    Stage,
+    best_of,
+    finished,
+    gather,
+    improved,
+    slim,
+    unset,
+)
 from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
 from mjx_drax.search.devices import gathered, spread
-from mjx_drax.search.family import Family, Tracked
+from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
     begin,
-    between,
     chain_keys,
     iterate,
     joined,
     noise_at,
-    ranking,
-    restart_at,
-    worst_constraints,
 )
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
+from mjx_drax.search.replayer import Replayer
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
 from mjx_drax.search.sizes import median, scale_and_floor, sizes_of
@@ -70,115 +76,11 @@ of an attempt's where that is more."""
 STRAGGLERS = 0.0005
 """Share of chains for which the polish of the others does not wait."""
 
-CHEAPER = 1e-3
-"""A rollout is an improvement if it is cheaper by more than this share."""
-
-SHARES = (0.5, 0.2, 0.05)
-"""Of what a round has changed, these are rolled out where all of it brings no improvement."""
-
 FAR, COOLER, MOST_COOLINGS = 10.0, 0.25, 4
 """Where noise brings max|h| of most chains to so many times that of the initial knots (or its own
 square), the attempt starts again with so much of the noise, as do those after it; so many times."""
 
 Progress = Callable[[int, int, Info], None]
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Chains:
-    """Where chains are, one row each.
-
-    Attributes:
-        state, info: of every row.
-        feasible_since: since which iteration each was feasible, or -1, (rows,).
-        missed: whether it was replayed, and did not come to where it should, (rows,).
-    """
-
-    state: State
-    info: Info
-    feasible_since: np.ndarray
-    missed: np.ndarray
-
-    @classmethod
-    def of(cls, state: State, info: Info, feasible_since: np.ndarray) -> Chains:
-        """Chains that were not replayed."""
-        return cls(state, info, feasible_since, np.zeros(len(feasible_since), bool))
-
-    @property
-    def cost(self) -> np.ndarray:
-        """Of the knots, (rows,)."""
-        return np.asarray(self.info.cost)
-
-    @property
-    def feasible(self) -> np.ndarray:
-        """Whether max|h| < `FEASIBLE`, (rows,)."""
-        return np.asarray(self.info.max_defect) < FEASIBLE
-
-    @property
-    def sound(self) -> np.ndarray:
-        """Feasible, and not known to be missed by their replay, (rows,)."""
-        return self.feasible & ~self.missed
-
-    @property
-    def worth(self) -> np.ndarray:
-        """The cost of what is sound, and infinity of the rest, (rows,)."""
-        return np.where(self.sound, self.cost, np.inf)
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Stage:
-    """How far a search is: all that the rest of it depends on.
-
-    Attributes:
-        attempt: the one that is under way, from 0.
-        heated: whether it has noise.
-        finishing: how often it went on with what is kept instead; see `_begin_to_finish`.
-        cost_scale: of each problem, (N,).
-        floor: what costs of each problem are measured from, (N,); see `sizes`.
-        todo: problems of this attempt.
-        place: how many of them are done; the chunk is what follows.
-        begun: whether `now` belongs to this chunk; else it has not begun.
-        owners: for which of its problem's chains each row works, (rows,).
-        kept: the best so far of all chains of all problems, (N * chains,); None before any.
-        now: where the chunk's chains are, (rows,).
-        before: `now.worth` when it was asked last whether to wait, (rows,).
-        damping: of each row between rollouts, (rows,).
-        step: how many of the attempt's iterations are done.
-        ends: of a single problem, `worth` of the places when the latest attempts without and with
-            noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
-        rollouts: how many rollouts, and rounds of them, are done.
-        records: iterations done and diagnostics of the rows, for every report of a single problem.
-        began: for every attempt, and every start of it, after how many iterations it began and its
-            noise ended.
-        coolings: how often an attempt has started again with less noise.
-    """
-
-    attempt: int
-    heated: bool
-    finishing: int
-    cost_scale: np.ndarray
-    floor: np.ndarray
-    todo: np.ndarray
-    place: int
-    begun: bool
-    owners: np.ndarray
-    kept: Chains | None
-    now: Chains
-    before: np.ndarray
-    damping: np.ndarray
-    step: int
-    ends: np.ndarray
-    steps: np.ndarray
-    rollouts: int
-    records: tuple[tuple[int, Info], ...]
-    began: tuple[tuple[int, int], ...] = ()
-    coolings: int = 0
-
-    @property
-    def done(self) -> int:
-        """Iterations of a single problem's search, at the last report."""
-        return self.records[-1][0]
 
 
 @dataclass(frozen=True)
@@ -310,7 +212,7 @@ class Search:
             _, info = jax.block_until_ready(self._iterated(state, 0, 0))
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
         now = Chains.of(state, info, np.full(rows, -1))
-        kept = None if family.alone else _unset(now, family.count * self.chains)
+        kept = None if family.alone else unset(now, family.count * self.chains)
         owners, ones = np.tile(np.arange(self.chains), self.size), np.ones(rows)
         self.stage = Stage(
             attempt=0,
@@ -345,9 +247,9 @@ class Search:
     def _no_worse(self, found: Chains, guessed: Chains) -> tuple[Chains, np.ndarray]:
         """What was found; for a chain whose guess was feasible and better, the guess; and which."""
         inside = np.asarray(guessed.info.max_violation) == 0.0
-        better = _improved(found, guessed, self.stage.floor[:1]) & inside
+        better = improved(found, guessed, self.stage.floor[:1]) & inside
         source = np.arange(self.chains) + self.chains * better
-        state, info = _gather((found.state, found.info), (guessed.state, guessed.info), source)
+        state, info = gather((found.state, found.info), (guessed.state, guessed.info), source)
         return Chains.of(state, info, np.where(better, 0, found.feasible_since)), better
 
     def _guessed(self) -> Chains:
@@ -545,7 +447,7 @@ class Search:
         if kept is None:
             return now
         if stage.finishing:
-            return _finished(kept, now)
+            return finished(kept, now)
         if self.family.alone:
             return best_of(kept, now, stage.owners)
         fresh = min(self.size, len(stage.todo) - stage.place)
@@ -554,7 +456,7 @@ class Search:
         first = np.repeat(np.arange(fresh) * self.chains, self.chains)
         mine, found = (
             jax.tree.map(lambda a, n=n: np.asarray(a)[n], chains)
-            for chains, n in ((kept, rows), (_slim(now), slice(len(rows))))
+            for chains, n in ((kept, rows), (slim(now), slice(len(rows))))
         )
         best = best_of(mine, found, stage.owners[: len(rows)] + first)
         jax.tree.map(lambda a, new: a.__setitem__(rows, new), kept, best)
@@ -729,6 +631,17 @@ class Search:
 
     # Rollouts
 
+    @property
+    def _replayer(self) -> Replayer:
+        """What replays the chunk's chains."""
+        indices, floor = self.indices, np.repeat(self.stage.floor[self.indices], self.chains)
+
+        def diagnosed(state: State) -> tuple[State, Info]:
+            state, info = self._iterated(state, 0, 0)  # compiled already
+            return gathered(state, self.mesh), info
+
+        return Replayer(self.family, indices, self.question, floor, diagnosed)
+
     def _roll_out(self) -> bool:
         """The rollouts that follow an attempt; False if they are interrupted. See `Rollouts`."""
         rollouts, stage = self.settings.rollouts, self.stage
@@ -740,13 +653,13 @@ class Search:
         better = np.zeros(len(stage.owners), bool)
         if self.guess is not None and stage.attempt == stage.rollouts == 0:
             # The attempt may have lost a guess that touches where it should: it goes on from it
-            guessed = self._rolled_out(self._guessed(), 0.0, stage.done)
+            guessed = self._replayer.rolled_out(self._guessed(), 0.0, stage.done)
             now, better = self._no_worse(now, guessed)
         if (
             stage.rollouts == 0
             and not better.any()
             and now.feasible.all()
-            and not self._replayed(now, 1.0)[1].any()
+            and not self._replayer.replayed(now, 1.0)[1].any()
         ):
             return True
         try:
@@ -762,7 +675,7 @@ class Search:
         stage, everyone = self.stage, np.arange(len(self.stage.owners))
         now, damping, count = stage.now, stage.damping, stage.rollouts + 1
         if stage.rollouts < first:
-            now = self._rolled_out(now, float(stage.rollouts > 0), stage.done)
+            now = self._replayer.rolled_out(now, float(stage.rollouts > 0), stage.done)
             self.stage = replace(stage, now=now, rollouts=count)
             return
         done, end = stage.done + iterations, self.flow.iterations + self.settings.after
@@ -770,109 +683,13 @@ class Search:
         state, info = self._iterated(state, end - iterations, end)
         missed = np.ones(len(everyone), bool)  # until it is shown
         found = self._whole(Chains(state, info, np.full(len(everyone), done), missed))
-        found, better = self._rolled_out_in_part(now, found, done)
+        found, better = self._replayer.rolled_out_in_part(now, found, done)
         now = best_of(now, found, everyone)
         factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))
         damping = np.clip(damping * factor, *DAMPING_RANGE)
         if not better.any() and (damping == DAMPING_RANGE[1]).all():
             count = total  # more would change nothing
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
-
-    def _replayed(self, chains: Chains, with_feedback: float) -> tuple[Tracked, np.ndarray]:
-        """Replays of chains, and which of them miss; see `_tracked`."""
-        knots, gains = chains.state.trajectory, with_feedback * np.asarray(chains.state.gains)
-        return self._tracked(slice(None), self._plans(knots), np.asarray(knots.u), gains)
-
-    def _tracked(
-        self, rows: np.ndarray | slice, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
-    ) -> tuple[Tracked, np.ndarray]:
-        """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
-        family, of = self.family, np.repeat(self.indices, self.chains)
-        ran = family.tracked(of[rows], plan, u, gains)
-        return ran, ran.left if family.problem.goal is None else ~family.reached(ran.states)
-
-    def _rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
-        """The best of chains and of their rollouts."""
-        ran, missed = self._replayed(chains, with_feedback)
-        found = self._as_knots(chains, ran.states, ran.controls, missed, done)
-        if with_feedback:  # a plan is fine that is reached in one of two ways
-            missed = missed & chains.missed
-        return best_of(replace(chains, missed=missed), found, np.arange(len(missed)))
-
-    def _as_knots(
-        self,
-        chains: Chains,
-        states: np.ndarray,
-        controls: np.ndarray,
-        missed: np.ndarray,
-        done: int,
-    ) -> Chains:
-        """Chains whose knots are rollouts (rows, K + 1, nx) of them, some of which have missed."""
-        knots = chains.state.trajectory
-        x, u = (jnp.asarray(a, knots.x.dtype) for a in (states[:, 1:], controls))
-        rolled = Trajectory(x, u, start=knots.start)
-        state = restart_at(self.question[1], self.question[0], chains.state, rolled)
-        state, info = self._iterated(state, 0, 0)  # compiled already; just diagnoses
-        own = np.zeros(len(x), bool)
-        if self.family.problem.goal is not None:
-            ran_to = replace(gathered(state.trajectory, self.mesh), slack=None)
-            own, info = missed, self._by_the_engine(info, ran_to, ~missed)
-        return self._whole(Chains(state, info, np.full(len(x), done), own))
-
-    def _rolled_out_in_part(
-        self, now: Chains, whole: Chains, done: int
-    ) -> tuple[Chains, np.ndarray]:
-        """What a round has made of chains `now`, rolled out; or a share of it, where all is worse.
-
-        Also the largest share that has brought an improvement, 0 for none, (rows,).
-        """
-        floor = np.repeat(self.stage.floor[self.indices], self.chains)
-        found, everyone = self._rolled_out(whole, 1.0, done), np.arange(len(now.missed))
-        better = np.where(_improved(now, found, floor), 1.0, 0.0)
-        rest = np.flatnonzero(better == 0.0)
-        if not len(rest):
-            return found, better
-        # Shares are replayed side by side: a replay takes its time by its knots, not by its rows
-        ends, count = (now.state.trajectory, whole.state.trajectory), len(SHARES)
-        parts = [between(self.question[1], self.question[0], *ends, share) for share in SHARES]
-        plan = np.concatenate([self._plans(part)[rest] for part in parts])
-        u = np.concatenate([np.asarray(part.u)[rest] for part in parts])
-        gains = np.tile(np.asarray(whole.state.gains)[rest], (count, 1, 1, 1))
-        ran, missed = self._tracked(np.tile(rest, count), plan, u, gains)
-        of_shares = (np.split(a, count) for a in (ran.states, ran.controls, missed))
-        for share, *of_share in zip(SHARES, *of_shares, strict=True):
-            replays = self._plans(ends[1]), np.array(ends[1].u), np.ones(len(better), bool)
-            for of_all, of_rest in zip(replays, of_share, strict=True):
-                of_all[rest] = of_rest
-            part = self._as_knots(whole, *replays, done)
-            # What was settled stays: answers must not depend on neighbours in a batch
-            info = jax.tree.map(partial(jnp.where, better == 1.0, jnp.inf), part.info)
-            part = replace(part, info=info)
-            better = np.where(_improved(now, part, floor), np.maximum(better, share), better)
-            found = best_of(found, part, everyone)
-        return found, better
-
-    def _plans(self, knots: Trajectory) -> np.ndarray:
-        """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""
-        return np.concatenate([self.family.starts(self.indices, knots)[:, None], knots.x], axis=1)
-
-    def _by_the_engine(self, info: Info, knots: Trajectory, won: np.ndarray) -> Info:
-        """Diagnostics of rollouts; max|h| of those that won (rows,) as the replaying engine has it.
-
-        Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
-        that reaches the goal is a motion of the engine: it counts, if it keeps the constraints.
-        """
-        family, defect = self.family, np.array(info.max_defect)
-        which = np.flatnonzero(won & ~(defect < FEASIBLE))
-        if not (family.problem.dynamics.kinked and len(which)):
-            return info
-        broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
-        plan = self._plans(knots)
-        for row in which.tolist():
-            problem = family.at(int(self.indices[row // self.chains]))
-            off = problem.engine_defects(plan[row], np.asarray(knots.u[row]))
-            defect[row] = max((off / np.asarray(problem.unit)).max(), broken[row])
-        return replace(info, max_defect=jnp.asarray(defect))
 
     # Reports, recordings, checkpoints
 
@@ -902,7 +719,7 @@ class Search:
         now, settings = self.stage.now, self.settings
         if settings.attempts > 1 and self.family.alone:
             rows = np.arange(len(self.stage.owners))
-            _gather((now.state, now.info), (now.state, now.info), rows)
+            gather((now.state, now.info), (now.state, now.info), rows)
         if self.recorder is not None:
             knot_defects(self.family.problem, now.state.trajectory)
         if self.family.alone:
@@ -1010,71 +827,3 @@ def _drawn_by_row(
 def _keys_of(key: Array, indices: Array) -> Array:
     """The key of each problem, whatever is solved beside it."""
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
-
-
-def _slim(chains: Chains) -> Chains:
-    """The chains with what thousands of problems keep of them: knots and gains."""
-    state = chains.state
-    knots = replace(state.trajectory, slack=None)
-    nothing: Any = ()
-    slim = State(knots, nothing, nothing, state.gains, nothing, nothing, nothing, nothing)
-    return replace(chains, state=slim)
-
-
-def _unset(like: Chains, rows: int) -> Chains:
-    """Places on the host for the best of so many chains, infinitely bad so far."""
-    empty: Chains = jax.tree.map(lambda a: np.zeros((rows, *a.shape[1:]), a.dtype), _slim(like))
-    worst: Info = jax.tree.map(lambda a: np.full(rows, np.inf), like.info)  # an array each
-    return replace(empty, info=worst, feasible_since=np.full(rows, -1))
-
-
-def _improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
-    """Which chains became sound, or cheaper by more than `CHEAPER`, (chains,)."""
-    before, after = (np.asarray(a.info.cost, float) - floor for a in (kept, found))
-    cheaper = after < before - CHEAPER * np.abs(before)
-    return found.sound & (cheaper | ~kept.sound)
-
-
-def _finished(kept: Chains, now: Chains) -> Chains:
-    """The chains that were polished on; those kept for which it has ended worse."""
-    worse = np.where(now.sound, now.cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
-    source = np.arange(len(worse)) + len(worse) * ~worse
-    state, info = _gather((kept.state, kept.info), (now.state, now.info), source)
-    since = np.where(worse, kept.feasible_since, now.feasible_since)
-    return Chains(state, info, since, np.where(worse, kept.missed, now.missed))
-
-
-def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
-    """For every chain the best of what it has and of what was found for it.
-
-    owners (chains,) says for which chain each row of `found` has worked. Feasible beats infeasible,
-    then sound beats what its replay missed, then the cheaper or the less infeasible wins.
-    """
-    chains = len(owners)
-
-    def both(values: Callable[[Chains], ArrayLike]) -> np.ndarray:
-        return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
-
-    infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
-    of = np.concatenate([np.arange(chains), owners])
-    missed = both(lambda a: a.missed)
-    order = np.lexsort((value, missed, infeasible, of))
-    source = order[np.unique(of[order], return_index=True)[1]]
-    pairs = (kept.state, kept.info), (found.state, found.info)
-    if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(pairs)):
-        state, info = jax.tree.map(lambda a, b: np.concatenate([a, b])[source], *pairs)
-    else:
-        state, info = _gather(*pairs, source)
-    return Chains(state, info, both(lambda a: a.feasible_since)[source], missed[source])
-
-
-@jax.jit
-def _gather(kept: Any, found: Any, source: Array) -> Any:
-    """Rows `source` (chains,) of two batches, one after the other."""
-    chains = len(source)
-
-    def rows(a: Array, b: Array) -> Array:
-        mine = (source < chains).reshape(-1, *[1] * (a.ndim - 1))
-        return jnp.where(mine, a[source % chains], b[source % chains])
-
-    return jax.tree.map(rows, kept, found)

@@ -271,7 +271,8 @@ class Family:
 
         def run(rows: np.ndarray, gains: np.ndarray) -> Tracked:
             states, controls = self.replay(of[rows], plan[rows], u[rows], gains)
-            off = largest(states, plan[rows]) / np.maximum(way[rows], np.finfo(float).tiny)
+            with np.errstate(over="ignore"):  # where a plan stands still and its replay does not
+                off = largest(states, plan[rows]) / np.maximum(way[rows], np.finfo(float).tiny)
             return Tracked(states, controls, gains, off)
 
         way = largest(plan, np.broadcast_to(plan[:, :1], plan.shape))

@@ -33,7 +33,8 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
 from mjx_drax.problem.dynamics import FunctionDynamics
-from mjx_drax.search.engine import Chains, Search, best_of
+from mjx_drax.search.chains import Chains, best_of
+from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, begin, evaluate, iterate, partition, restart_at
@@ -331,7 +332,7 @@ def test_rollouts_follow_where_f_has_kinks(balls):
 def test_where_all_that_a_round_changes_is_worse_a_share_of_it_helps(balls, monkeypatch):
     solver = Restarts(attempts=1, polish=Polish(iterations=0))
     in_part = solve(balls[1], chains=8, solver=solver)
-    monkeypatch.setattr("mjx_drax.search.engine.SHARES", ())
+    monkeypatch.setattr("mjx_drax.search.replayer.SHARES", ())
     whole = solve(balls[1], chains=8, solver=solver)
     assert in_part.feasible.all()
     assert (in_part.cost < whole.cost).all()

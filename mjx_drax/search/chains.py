@@ -1,0 +1,187 @@
+"""Where the chains of a search are, how far it is, and which answer of a chain is better."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.method.descent import Info
+from mjx_drax.method.langevin import State
+from mjx_drax.search.iterate import FEASIBLE, ranking
+
+CHEAPER = 1e-3
+"""A rollout is an improvement if it is cheaper by more than this share."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Chains:
+    """Where chains are, one row each.
+
+    Attributes:
+        state, info: of every row.
+        feasible_since: since which iteration each was feasible, or -1, (rows,).
+        missed: whether it was replayed, and did not come to where it should, (rows,).
+    """
+
+    state: State
+    info: Info
+    feasible_since: np.ndarray
+    missed: np.ndarray
+
+    @classmethod
+    def of(cls, state: State, info: Info, feasible_since: np.ndarray) -> Chains:
+        """Chains that were not replayed."""
+        return cls(state, info, feasible_since, np.zeros(len(feasible_since), bool))
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Of the knots, (rows,)."""
+        return np.asarray(self.info.cost)
+
+    @property
+    def feasible(self) -> np.ndarray:
+        """Whether max|h| < `FEASIBLE`, (rows,)."""
+        return np.asarray(self.info.max_defect) < FEASIBLE
+
+    @property
+    def sound(self) -> np.ndarray:
+        """Feasible, and not known to be missed by their replay, (rows,)."""
+        return self.feasible & ~self.missed
+
+    @property
+    def worth(self) -> np.ndarray:
+        """The cost of what is sound, and infinity of the rest, (rows,)."""
+        return np.where(self.sound, self.cost, np.inf)
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Stage:
+    """How far a search is: all that the rest of it depends on.
+
+    Attributes:
+        attempt: the one that is under way, from 0.
+        heated: whether it has noise.
+        finishing: how often it went on with what is kept instead; see `_begin_to_finish`.
+        cost_scale: of each problem, (N,).
+        floor: what costs of each problem are measured from, (N,); see `sizes`.
+        todo: problems of this attempt.
+        place: how many of them are done; the chunk is what follows.
+        begun: whether `now` belongs to this chunk; else it has not begun.
+        owners: for which of its problem's chains each row works, (rows,).
+        kept: the best so far of all chains of all problems, (N * chains,); None before any.
+        now: where the chunk's chains are, (rows,).
+        before: `now.worth` when it was asked last whether to wait, (rows,).
+        damping: of each row between rollouts, (rows,).
+        step: how many of the attempt's iterations are done.
+        ends: of a single problem, `worth` of the places when the latest attempts without and with
+            noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
+        rollouts: how many rollouts, and rounds of them, are done.
+        records: iterations done and diagnostics of the rows, for every report of a single problem.
+        began: for every attempt, and every start of it, after how many iterations it began and its
+            noise ended.
+        coolings: how often an attempt has started again with less noise.
+    """
+
+    attempt: int
+    heated: bool
+    finishing: int
+    cost_scale: np.ndarray
+    floor: np.ndarray
+    todo: np.ndarray
+    place: int
+    begun: bool
+    owners: np.ndarray
+    kept: Chains | None
+    now: Chains
+    before: np.ndarray
+    damping: np.ndarray
+    step: int
+    ends: np.ndarray
+    steps: np.ndarray
+    rollouts: int
+    records: tuple[tuple[int, Info], ...]
+    began: tuple[tuple[int, int], ...] = ()
+    coolings: int = 0
+
+    @property
+    def done(self) -> int:
+        """Iterations of a single problem's search, at the last report."""
+        return self.records[-1][0]
+
+
+def slim(chains: Chains) -> Chains:
+    """The chains with what thousands of problems keep of them: knots and gains."""
+    state = chains.state
+    knots = replace(state.trajectory, slack=None)
+    nothing: Any = ()
+    few = State(knots, nothing, nothing, state.gains, nothing, nothing, nothing, nothing)
+    return replace(chains, state=few)
+
+
+def unset(like: Chains, rows: int) -> Chains:
+    """Places on the host for the best of so many chains, infinitely bad so far."""
+    empty: Chains = jax.tree.map(lambda a: np.zeros((rows, *a.shape[1:]), a.dtype), slim(like))
+    worst: Info = jax.tree.map(lambda a: np.full(rows, np.inf), like.info)  # an array each
+    return replace(empty, info=worst, feasible_since=np.full(rows, -1))
+
+
+def improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
+    """Which chains became sound, or cheaper by more than `CHEAPER`, (chains,)."""
+    before, after = (np.asarray(a.info.cost, float) - floor for a in (kept, found))
+    cheaper = after < before - CHEAPER * np.abs(before)
+    return found.sound & (cheaper | ~kept.sound)
+
+
+def finished(kept: Chains, now: Chains) -> Chains:
+    """The chains that were polished on; those kept for which it has ended worse."""
+    worse = np.where(now.sound, now.cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
+    source = np.arange(len(worse)) + len(worse) * ~worse
+    state, info = gather((kept.state, kept.info), (now.state, now.info), source)
+    since = np.where(worse, kept.feasible_since, now.feasible_since)
+    return Chains(state, info, since, np.where(worse, kept.missed, now.missed))
+
+
+def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
+    """For every chain the best of what it has and of what was found for it.
+
+    owners (chains,) says for which chain each row of `found` has worked. Feasible beats infeasible,
+    then sound beats what its replay missed, then the cheaper or the less infeasible wins.
+    """
+    chains = len(owners)
+
+    def both(values: Callable[[Chains], ArrayLike]) -> np.ndarray:
+        return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
+
+    infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
+    of = np.concatenate([np.arange(chains), owners])
+    missed = both(lambda a: a.missed)
+    order = np.lexsort((value, missed, infeasible, of))
+    source = order[np.unique(of[order], return_index=True)[1]]
+    pairs = (kept.state, kept.info), (found.state, found.info)
+    if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(pairs)):
+        state, info = jax.tree.map(lambda a, b: np.concatenate([a, b])[source], *pairs)
+    else:
+        state, info = gather(*pairs, source)
+    return Chains(state, info, both(lambda a: a.feasible_since)[source], missed[source])
+
+
+@jax.jit
+def gather(kept: Any, found: Any, source: Array) -> Any:
+    """Rows `source` (chains,) of two batches, one after the other."""
+    chains = len(source)
+
+    def rows(a: Array, b: Array) -> Array:
+        mine = (source < chains).reshape(-1, *[1] * (a.ndim - 1))
+        return jnp.where(mine, a[source % chains], b[source % chains])
+
+    return jax.tree.map(rows, kept, found)

@@ -1,0 +1,141 @@
+"""Rollouts of chains by the engine that replays them, as knots to go on from; see `Rollouts`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_drax.method.descent import Info
+from mjx_drax.method.langevin import State
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.chains import Chains, best_of, improved
+from mjx_drax.search.family import Family, Tracked
+from mjx_drax.search.iterate import FEASIBLE, Question, between, restart_at, worst_constraints
+
+SHARES = (0.5, 0.2, 0.05)
+"""Of what a round has changed, these are rolled out where all of it brings no improvement."""
+
+
+@dataclass(frozen=True)
+class Replayer:
+    """Replays the chains of a chunk of problems.
+
+    Attributes:
+        family: the problems.
+        indices: those of the chunk, (n,).
+        question: what the chunk's rows share, and what each has of its own.
+        floor: what the costs of each row are measured from, (rows,).
+        diagnosed: states of all rows, on one device, and where they are.
+    """
+
+    family: Family
+    indices: np.ndarray
+    question: tuple[Question, Question]
+    floor: np.ndarray
+    diagnosed: Callable[[State], tuple[State, Info]]
+
+    @property
+    def of(self) -> np.ndarray:
+        """The problem of each row, (rows,)."""
+        return np.repeat(self.indices, len(self.floor) // len(self.indices))
+
+    def replayed(self, chains: Chains, with_feedback: float) -> tuple[Tracked, np.ndarray]:
+        """Replays of chains, and which of them miss; see `_tracked`."""
+        knots, gains = chains.state.trajectory, with_feedback * np.asarray(chains.state.gains)
+        return self._tracked(slice(None), self._plans(knots), np.asarray(knots.u), gains)
+
+    def _tracked(
+        self, rows: np.ndarray | slice, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+    ) -> tuple[Tracked, np.ndarray]:
+        """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
+        family = self.family
+        ran = family.tracked(self.of[rows], plan, u, gains)
+        return ran, ran.left if family.problem.goal is None else ~family.reached(ran.states)
+
+    def rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
+        """The best of chains and of their rollouts."""
+        ran, missed = self.replayed(chains, with_feedback)
+        found = self._as_knots(chains, ran.states, ran.controls, missed, done)
+        if with_feedback:  # a plan is fine that is reached in one of two ways
+            missed = missed & chains.missed
+        return best_of(replace(chains, missed=missed), found, np.arange(len(missed)))
+
+    def _as_knots(
+        self,
+        chains: Chains,
+        states: np.ndarray,
+        controls: np.ndarray,
+        missed: np.ndarray,
+        done: int,
+    ) -> Chains:
+        """Chains whose knots are rollouts (rows, K + 1, nx) of them, some of which have missed."""
+        knots = chains.state.trajectory
+        x, u = (jnp.asarray(a, knots.x.dtype) for a in (states[:, 1:], controls))
+        rolled = Trajectory(x, u, start=knots.start)
+        state = restart_at(self.question[1], self.question[0], chains.state, rolled)
+        state, info = self.diagnosed(state)
+        own = np.zeros(len(x), bool)
+        if self.family.problem.goal is not None:
+            ran_to = replace(state.trajectory, slack=None)
+            own, info = missed, self._by_the_engine(info, ran_to, ~missed)
+        return Chains(state, info, np.full(len(x), done), own)
+
+    def rolled_out_in_part(
+        self, now: Chains, whole: Chains, done: int
+    ) -> tuple[Chains, np.ndarray]:
+        """What a round has made of chains `now`, rolled out; or a share of it, where all is worse.
+
+        Also the largest share that has brought an improvement, 0 for none, (rows,).
+        """
+        floor = self.floor
+        found, everyone = self.rolled_out(whole, 1.0, done), np.arange(len(now.missed))
+        better = np.where(improved(now, found, floor), 1.0, 0.0)
+        rest = np.flatnonzero(better == 0.0)
+        if not len(rest):
+            return found, better
+        # Shares are replayed side by side: a replay takes its time by its knots, not by its rows
+        ends, count = (now.state.trajectory, whole.state.trajectory), len(SHARES)
+        parts = [between(self.question[1], self.question[0], *ends, share) for share in SHARES]
+        plan = np.concatenate([self._plans(part)[rest] for part in parts])
+        u = np.concatenate([np.asarray(part.u)[rest] for part in parts])
+        gains = np.tile(np.asarray(whole.state.gains)[rest], (count, 1, 1, 1))
+        ran, missed = self._tracked(np.tile(rest, count), plan, u, gains)
+        of_shares = (np.split(a, count) for a in (ran.states, ran.controls, missed))
+        for share, *of_share in zip(SHARES, *of_shares, strict=True):
+            replays = self._plans(ends[1]), np.array(ends[1].u), np.ones(len(better), bool)
+            for of_all, of_rest in zip(replays, of_share, strict=True):
+                of_all[rest] = of_rest
+            part = self._as_knots(whole, *replays, done)
+            # What was settled stays: answers must not depend on neighbours in a batch
+            info = jax.tree.map(partial(jnp.where, better == 1.0, jnp.inf), part.info)
+            part = replace(part, info=info)
+            better = np.where(improved(now, part, floor), np.maximum(better, share), better)
+            found = best_of(found, part, everyone)
+        return found, better
+
+    def _plans(self, knots: Trajectory) -> np.ndarray:
+        """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""
+        return np.concatenate([self.family.starts(self.indices, knots)[:, None], knots.x], axis=1)
+
+    def _by_the_engine(self, info: Info, knots: Trajectory, won: np.ndarray) -> Info:
+        """Diagnostics of rollouts; max|h| of those that won (rows,) as the replaying engine has it.
+
+        Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
+        that reaches the goal is a motion of the engine: it counts, if it keeps the constraints.
+        """
+        family, defect = self.family, np.array(info.max_defect)
+        which = np.flatnonzero(won & ~(defect < FEASIBLE))
+        if not (family.problem.dynamics.kinked and len(which)):
+            return info
+        broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
+        plan, of = self._plans(knots), self.of
+        for row in which.tolist():
+            problem = family.at(int(of[row]))
+            off = problem.engine_defects(plan[row], np.asarray(knots.u[row]))
+            defect[row] = max((off / np.asarray(problem.unit)).max(), broken[row])
+        return replace(info, max_defect=jnp.asarray(defect))
