@@ -54,6 +54,8 @@ class GaussNewton(Metric):
 
     ladder: ClassVar = (1.0, 1 / 2, 1 / 4, 1 / 16, 0.0)
     has_gains: ClassVar = True
+    scaled_by_box: ClassVar = True
+    polished: ClassVar = True
     derivatives: Differentiator = field(default_factory=Autodiff)
     state_damping: ArrayLike | None = None
 

@@ -83,7 +83,7 @@ class Langevin:
         barrier_weight: schedule of rho.
         scale: units of the four schedules; `Restarts` measures them.
         preconditioner: the metric M.
-        bounds: how bounds are kept.
+        bounds: how bounds are kept; a polish keeps them by a barrier of its own.
         adjusted: Metropolis-adjusted noisy steps (static; with `Identity` only): a chain without
             constraints then samples exp(-c / sigma^2) exactly, whatever the step size.
     """

@@ -57,12 +57,18 @@ class Metric:
         has_gains: whether its directions bring feedback gains.
         full_multiplier_steps: whether multipliers take their whole step, whatever size the line
             search chooses for the knots.
+        scaled_by_box: whether the default solver takes its direction in coordinates without units
+            (`search.scaled`); it then needs `derivatives`.
+        polished: whether the default solver polishes what this metric has found, if `derivatives`
+            are exact.
     """
 
     derivatives: Any = None
     ladder: ClassVar[tuple[float, ...]] = (*(0.5**i for i in range(9)), 0.0)
     has_gains: ClassVar[bool] = False
     full_multiplier_steps: ClassVar[bool] = False
+    scaled_by_box: ClassVar[bool] = False
+    polished: ClassVar[bool] = False
 
     def at(self, model: Model) -> Any:
         """M at an iterate, in any form that `solve` and `sample` take."""

@@ -39,6 +39,7 @@ class Dynamics:
         state_damping: damping of states beside that of controls in `GaussNewton`.
         twice: whether the polish differentiates f twice; else it learns what curvature f has.
         checked: f has been tried where it was made, and need not be traced once more.
+        phases: numbers of knots of the phases of free duration; () where dt is fixed.
         x_names, u_names: of the entries of states and controls, for tables, plots and errors, such
             as "angle [rad]"; without them x0, x1, ... and u0, u1, ...
     """
@@ -50,6 +51,7 @@ class Dynamics:
     state_damping: float = 1.0
     twice: bool = True
     checked: bool = False
+    phases: tuple[int, ...] = ()
     x_names: tuple[str, ...] = ()
     u_names: tuple[str, ...] = ()
 

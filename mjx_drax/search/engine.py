@@ -647,7 +647,7 @@ class Search:
         rollouts, stage = self.settings.rollouts, self.stage
         assert rollouts is not None
         total = rollouts.first + rollouts.rounds
-        if total == 0 or self.settings.after < rollouts.iterations:
+        if total == 0:
             return True
         now = self._whole(stage.now)
         better = np.zeros(len(stage.owners), bool)

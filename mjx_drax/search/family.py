@@ -16,7 +16,6 @@ from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish
-from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import plain
 from mjx_drax.problem.trajectory import Trajectory
@@ -291,10 +290,8 @@ class Family:
     def reached(self, states: np.ndarray) -> np.ndarray:
         """Whether motions x_0..x_K, (n, K + 1, nx), end at the goal, which the problems share."""
         problem = self.at(0)
-        ends = [float(problem.times[-1])] * len(states)
-        if isinstance(problem.dynamics, Extended):  # each ends at a time of its own
-            times, begin = problem.dynamics.times, float(problem.t_init)
-            ends = [float(times(motion, begin)[-1]) for motion in states]
+        times, begin = problem.dynamics.times, float(problem.t_init)
+        ends = [float(times(motion, begin)[-1]) for motion in states]
         return problem.all_reached(states[:, -1], ends)
 
 

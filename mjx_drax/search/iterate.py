@@ -172,19 +172,15 @@ def loop(
     """
     states, own = rows
 
-    def one(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
+    def flow_step(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
         return q.flow.step(q.problem, state, i + q.offset, tail, noise, moves, mixed)
-
-    def polished(i: Array, q: Question, state: State) -> State:
-        assert q.polish is not None  # for the type checker
-        return diffused_or_polished(q.flow, q.polish, q.problem, state, i + q.offset)
 
     if shared.polish is not None:
 
         @pruned
         def refine(carry: tuple[Array, State]) -> tuple[Array, State]:
             i, states = carry
-            return i + 1, by_row(shared, own, partial(polished, i), states)
+            return i + 1, by_row(shared, own, partial(iteration, i), states)
 
         def unfinished(carry: tuple[Array, State]) -> Array:
             i, states = carry
@@ -197,7 +193,7 @@ def loop(
 
         @pruned  # jit does it to all but the bodies of loops
         def step_or_diagnose(i: Array, carry: tuple[State, Info]) -> tuple[State, Info]:
-            moved: Any = by_row(shared, own, partial(one, i, i < stop), carry[0])
+            moved: Any = by_row(shared, own, partial(flow_step, i, i < stop), carry[0])
             return moved
 
         zeros = jnp.zeros(states.alive.shape)
@@ -206,7 +202,7 @@ def loop(
 
     @pruned
     def step(i: Array, states: State) -> State:
-        moved: State = by_row(shared, own, partial(one, i, None), states)[0]
+        moved: State = by_row(shared, own, partial(flow_step, i, None), states)[0]
         return moved
 
     states = jax.lax.fori_loop(start, stop, step, states)
@@ -225,24 +221,24 @@ def _diagnosis(q: Question, state: State) -> Info:
     return replace(info, residual=state.polish.residual, size=state.polish.cost)
 
 
-def diffused_or_polished(
-    flow: Langevin, polish: Polish, problem: Problem, state: State, iteration: Array
-) -> State:
-    """One iteration: a step of the flow while there is noise, then one of the polish.
+def iteration(i: Array, q: Question, state: State) -> State:
+    """Iteration i of a chain: a step of the flow while there is noise, then one of the polish.
 
     The penalty goes half its way; see `Restarts`. Between the two the chain is projected.
     """
-    noisy, key = iteration < flow.iterations, jax.random.fold_in(state.key, iteration)
+    flow, problem, polish, i = q.flow, q.problem, q.polish, i + q.offset
+    assert polish is not None  # for the type checker
+    noisy, key = i < flow.iterations, jax.random.fold_in(state.key, i)
     guided = jnp.asarray(flow.iterations > 0)
     state = jax.lax.cond(
-        guided & (iteration == flow.iterations),
+        guided & (i == flow.iterations),
         lambda: interior_point.projected(problem, state),
         lambda: state,
     )
-    t = jnp.minimum(flow.progress(iteration, True), 1.0)
+    t = jnp.minimum(flow.progress(i, True), 1.0)
     weights = replace(flow.weights(t), penalty=flow.weights(0.5 * t).penalty)
     model = flow.model(problem, state, weights, key, tail=False)
-    last = iteration + 1 == flow.iterations + polish.iterations
+    last = i + 1 == flow.iterations + polish.iterations
 
     def diffused() -> State:
         own = without_units(flow, problem)
@@ -254,7 +250,7 @@ def diffused_or_polished(
         diffused,
         lambda: interior_point.step(problem, state, model, polish, last, guided),
     )
-    return keep_finite(state, new, iteration, None)
+    return keep_finite(state, new, i, None)
 
 
 iterate = compiled(full_precision(loop), static_argnames=("tail", "noise", "diagnose"))

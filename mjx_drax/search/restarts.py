@@ -37,7 +37,6 @@ from mjx_drax.base.errors import (
     require_whole,
     shown,
 )
-from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Geometric, Scale
 from mjx_drax.polish.interior_point import Polish
@@ -98,11 +97,12 @@ class Restarts:
         heated: whether attempts after the first may be heated, or all descend like the first. None:
             they may; where f has kinks it stays None, and a single problem's are heated in turns
             with others until a chain is done.
-        rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, else nothing.
+        rollouts: what follows an attempt. None: `Rollouts()` where f has kinks and an attempt ends
+            with as many iterations as a round has, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
             `Polish()` with the tolerance of the precision, unless derivatives are sampled or the
-            metric is not `GaussNewton`.
+            metric is not `polished`, as `GaussNewton` is.
     """
 
     flow: Langevin = field(
@@ -149,20 +149,21 @@ class Restarts:
 
     def for_problem(self, problem: Problem) -> Restarts:
         """The same settings, with a value for each that is None."""
-        kinked = problem.dynamics.kinked
+        kinked, polish = problem.dynamics.kinked, self.polish or self._polish_for(problem)
+        rolled_out = kinked and replace(self, polish=polish).after >= Rollouts.iterations
         values: dict[str, Any] = {
             "within": WITHIN_KINKED if kinked else WITHIN,
             "enough": ENOUGH_KINKED if kinked else ENOUGH,
             "heated": None if kinked else True,
-            "rollouts": Rollouts() if kinked else Rollouts(first=0, rounds=0),
-            "polish": self._polish_for(problem),
+            "rollouts": Rollouts() if rolled_out else Rollouts(first=0, rounds=0),
+            "polish": polish,
         }
         return replace(self, **{n: v for n, v in values.items() if getattr(self, n) is None})
 
     def _polish_for(self, problem: Problem) -> Polish:
-        """The default polish; none if derivatives are sampled or the metric is another."""
+        """The default polish; none if derivatives are sampled or the metric is not `polished`."""
         metric = self.flow.preconditioner
-        if isinstance(metric, GaussNewton) and isinstance(metric.derivatives, Autodiff):
+        if metric.polished and isinstance(metric.derivatives, Autodiff):
             return Polish(TOLERANCE[problem.x_init.dtype.itemsize])
         return Polish(iterations=0)
 
@@ -248,6 +249,12 @@ def settled(
     settings = as_restarts(solver)
     settings.check(problem)
     settings = _polished(settings, problem, tolerance, max_iterations).for_problem(problem)
+    rollouts = settings.rollouts
+    if rollouts and rollouts.first + rollouts.rounds and rollouts.iterations > settings.after:
+        raise DraxError(
+            f"rollouts.iterations is {rollouts.iterations}, more than the {settings.after} that "
+            "follow the noise: give at most so many, or more iterations of the polish or the tail."
+        )
     metric, polish = settings.flow.preconditioner, settings.polish
     if polish is not None and polish.iterations and metric.derivatives is None:
         raise DraxError(

@@ -1,4 +1,4 @@
-"""Gauss-Newton's step in coordinates without units, as the default flow takes it.
+"""A metric's step in coordinates without units, as the default flow takes it.
 
 The penalty mu |h|^2 and the damping delta |dz|^2 add up numbers of different units. So the flow
 measures each state in parts of the box that initial knots are drawn from, sixths with noise and
@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Direction, Metric
 from mjx_drax.method.model import Derivatives, Linearization, Model, Multipliers, QuadraticCost
@@ -40,7 +39,7 @@ class Scaled(Metric):
     The changes of a free x_0 keep the user's units.
     """
 
-    metric: GaussNewton
+    metric: Metric
     x: Array
     u: Array
 
@@ -87,9 +86,9 @@ class Scaled(Metric):
 
 
 def without_units(flow: Langevin, problem: Problem) -> Langevin:
-    """The flow in coordinates without units; as it is with a metric other than `GaussNewton`."""
+    """The flow in coordinates without units, if its metric is `scaled_by_box`."""
     metric = flow.preconditioner
-    if not isinstance(metric, GaussNewton):
+    if not metric.scaled_by_box:
         return flow
     of_x, of_u = problem.widths
     x = jnp.where((jnp.asarray(flow.scale.noise) > 0.0) & (of_x > 0.0), of_x / HEATED, problem.unit)

@@ -192,7 +192,7 @@ def _advice(solution: Results) -> str:
     if where is not None:
         unfinished = solution.polished[solution.best_chain] == UNFINISHED
         more = ", more max_iterations" if unfinished else ""
-        free = getattr(solution.problem.dynamics, "phases", ())
+        free = solution.problem.dynamics.phases
         longer = "longer durations" if free else "a longer horizon"
         return (
             f"no plan is feasible; the best {where.told(solution.problem)}"

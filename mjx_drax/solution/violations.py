@@ -190,7 +190,7 @@ class Violation(NamedTuple):
         if self.knot < 0:
             return f"breaks the {words(self.kind)} {by}"
         at = f"at knot {self.knot}"
-        if not getattr(problem.dynamics, "phases", ()):  # else each chain has times of its own
+        if not problem.dynamics.phases:  # else each chain has times of its own
             at += f", {problem.times[self.knot]:.3g} s"
         name = entry_name(problem, self.kind, self.entry)
         if self.kind == TRACKING:

@@ -262,6 +262,7 @@ def test_a_langevin_is_one_attempt_as_it_stands():
         ({"rollouts": 3}, r"rollouts is 3: give Rollouts\(\) or None"),
         ({"rollouts": Rollouts(rounds=-1)}, "rollouts.rounds is -1"),
         ({"rollouts": Rollouts(iterations=0)}, "rollouts.iterations is 0"),
+        ({"rollouts": Rollouts(iterations=30), "polish": Polish(iterations=20)}, "than the 20 that"),
         ({"polish": 1e-6}, r"polish is 1e-06: give Polish\(\) or None"),
         ({"polish": Polish(0.0)}, "polish.tolerance is 0.0"),
         ({"polish": Polish(iterations=-1)}, "polish.iterations is -1"),
