@@ -1,7 +1,7 @@
 """What a solution says of its chains is true of the knots that it holds.
 
-The problems have four local optima of different costs, in which different chains end: knots, costs
-and verdicts of two chains that were swapped would not fit.
+The problems have several local optima, in which different chains end: knots, gains, costs and
+verdicts of two chains that were swapped would not fit.
 """
 
 from dataclasses import replace
@@ -69,6 +69,25 @@ def test_the_best_chain_of_every_problem_has_its_own_knots(batch):
         np.testing.assert_allclose(problem.max_defect(knots), batch.max_defect[i], atol=1e-5)
         np.testing.assert_allclose(batch.open_loop.states[i], batch.x[i], atol=1e-2)
     np.testing.assert_array_equal(batch.plan_cost, batch.chain_cost.min(axis=1))
+
+
+def test_the_best_chain_of_every_problem_has_its_own_gains():
+    """Controls count by their squares, so each is of either sign, and tells that of its gain."""
+    either_way = from_function(
+        lambda x, u: x + 0.1 * u**2,
+        x_init=[0.0],
+        nu=1,
+        dt=0.1,
+        horizon=1.0,
+        running_residual=lambda x, u: 0.3 * u**2,
+        terminal_residual=lambda x: 5.0 * (x - 1.0),
+    )
+    starts = np.array([[0.0], [0.1], [-0.2]], np.float32)
+    found = solve_batch(lambda x: replace(either_way, x_init=x), starts, CHAINS, solver=TWICE)
+    signs = np.sign(found.u[..., 0])
+    assert len(np.unique(signs, axis=0)) == len(starts)
+    # Where the state is ahead of the plan, the control's size has to shrink
+    np.testing.assert_array_equal(np.sign(found.gains[..., 0, 0]), -signs)
 
 
 def test_an_infeasible_chain_does_not_succeed(solution):
