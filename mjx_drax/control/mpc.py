@@ -325,7 +325,7 @@ class MPC:
         settings = self._flow, self._heated, self._polish, problem
         leaves, structure = jax.tree.flatten(settings)
         self._settings = jax.device_put(leaves)
-        self._planner = _planner(structure, self.explorers)
+        self.planner = _planner(structure, self.explorers)
         carried = _first(found.chains, self.explorers, self.seed, self._polish)
         self._plan = None
         self._apply(carried, x, t, 0.0)  # compiles
@@ -414,7 +414,7 @@ class MPC:
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
         """Plan in one launch, and use it if it is finite."""
         self._time = t  # of what is carried; the plan in use is older after one that failed
-        self._carried, device = self._planner(self._settings, carried, self._now(x, t, by))
+        self._carried, device = self.planner(self._settings, carried, self._now(x, t, by))
         plan: Plan = replace(jax.device_get(device), time=t)
         if plan.finite or self._plan is None:
             self._plan = plan

@@ -45,7 +45,7 @@ def run_once(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 @lru_cache
-def _options() -> dict[str, str | bool] | None:
+def known_options() -> dict[str, str | bool] | None:
     """Options for the present backend, if its compiler knows them and JAX is not told to hurry."""
     if jax.config.values["jax_disable_most_optimizations"]:
         return None
@@ -121,7 +121,7 @@ class compiled:
 
     @cached_property
     def _jitted(self) -> Any:
-        return jax.jit(self._function, compiler_options=_options(), **self._settings)
+        return jax.jit(self._function, compiler_options=known_options(), **self._settings)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""

@@ -71,7 +71,7 @@ class Checkpoint:
             )
         self.path = file_path(path)
         self.question: dict[str, Any] = {"format": FORMAT}
-        self.found, self._asked = _read(self.path)
+        self.found, self._asked = read(self.path)
         self._due, self._warned = time.monotonic() + EVERY, False
 
     def answered(self, name: str) -> Any:
@@ -175,7 +175,7 @@ def _flat(label: str, data: Any) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray] | None, dict[str, Any]]:
+def read(path: Path) -> tuple[dict[str, np.ndarray] | None, dict[str, Any]]:
     """The arrays of a file and the question that it belongs to; None and {} without a file."""
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:

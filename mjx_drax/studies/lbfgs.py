@@ -73,7 +73,7 @@ class LBFGS(Metric):
         steepest = super().direction(problem, model, key, memory)
         gradient, back = ravel_pytree(model.gradient)
         memory = self._remember(problem, memory, model.trajectory, gradient)
-        drift = back(-self._inverse_times(memory, gradient))
+        drift = back(-self.inverse_times(memory, gradient))
         update = memory.count == self.inner
         rate = jax.tree.map(lambda r: jnp.where(update, 0.5 * r, 0.0), steepest.multipliers)
         memory = replace(
@@ -94,9 +94,9 @@ class LBFGS(Metric):
         product = jnp.dot(s, y)
         good = (memory.count > 0) & (product > 1e-6 * jnp.dot(s, s))
         memory = replace(memory, count=memory.count + 1)
-        return self._with_pair(memory, s, y, jnp.where(good, product, 1.0), good)
+        return self.with_pair(memory, s, y, jnp.where(good, product, 1.0), good)
 
-    def _with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
+    def with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
         """The memory with a pair of which s'y is `product`, if it is good."""
 
         def push(rows: Array, new: Array) -> Array:
@@ -109,7 +109,7 @@ class LBFGS(Metric):
             curvature=push(memory.curvature, 1.0 / product),
         )
 
-    def _inverse_times(self, memory: Any, gradient: Array) -> Array:
+    def inverse_times(self, memory: Any, gradient: Array) -> Array:
         """M^{-1} times the gradient (n,); without pairs a steepest-descent step of unit length."""
         pairs = memory.curvature.shape[0]
         q, weights = gradient, [jnp.zeros(())] * pairs
@@ -161,7 +161,8 @@ class BFGS(LBFGS):
         none = jnp.zeros((), jnp.int32)
         return Matrix(jnp.eye(zero.shape[0]), jnp.zeros(()), trajectory, zero, none)
 
-    def _with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
+    def with_pair(self, memory: Any, s: Array, y: Array, product: Array, good: Array) -> Any:
+        """The memory with a pair of which s'y is `product`, if it is good; or a new beginning."""
         scale = jnp.where(good, product / jnp.maximum(jnp.dot(y, y), 1e-30), memory.scale)
         anew = (memory.scale == 0.0) | (jnp.dot(s, memory.gradient) > 0.0)
         inverse = jnp.where(anew, scale * jnp.eye(s.shape[0]), memory.inverse)
@@ -171,7 +172,7 @@ class BFGS(LBFGS):
         new = inverse + factor * jnp.outer(s, s) - cross - cross.T
         return replace(memory, inverse=jnp.where(good, new, inverse), scale=scale)
 
-    def _inverse_times(self, memory: Any, gradient: Array) -> Array:
+    def inverse_times(self, memory: Any, gradient: Array) -> Array:
         """M^{-1} times the gradient, cut to `longest`; before the first pair of unit length."""
         began = memory.scale > 0.0
         step = jnp.where(began, memory.inverse @ gradient, gradient)

@@ -112,7 +112,7 @@ def render_diffusion(
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
     width, height = even_size(size)
     lines, model = outcome_lines(solution, brief=True), mujoco_model(problem.dynamics)
-    moments = _moments(shown[0], seconds, fps)
+    moments = frame_moments(shown[0], seconds, fps)
     told = [_caption(solution, shown[0], at) if caption else [] for at in moments]
     lines = lines if caption else []
     below = 2 * round(_STRIP * height / 2)
@@ -152,7 +152,7 @@ def _chains(solution: Solution, count: int) -> list[int]:
     return list(dict.fromkeys(order))[:count]
 
 
-def _moments(history: ChainHistory, seconds: float, fps: float) -> Floats:
+def frame_moments(history: ChainHistory, seconds: float, fps: float) -> Floats:
     """Where each frame is among the snapshots: 2.5 is half way between the third and the fourth."""
     logs = np.log10(np.maximum(history.defects, FEASIBLE))
     fall = np.abs(np.diff(logs, axis=0)).mean(axis=1)
@@ -178,7 +178,7 @@ def _neighbours(at: float, count: int) -> tuple[int, int, float]:
     return before, min(before + 1, count - 1), at - before
 
 
-def _same_moment(best: ChainHistory, other: ChainHistory, at: float) -> tuple[int, int, float]:
+def same_moment(best: ChainHistory, other: ChainHistory, at: float) -> tuple[int, int, float]:
     """The neighbours of another chain when the best one is at a moment.
 
     That is at the same iteration of the same attempt, or where the other one ended before; when the
@@ -269,7 +269,7 @@ class Film:
         """
         best = self.shown[0]
         for chain, its_points in zip(self.shown[: len(points)], points, strict=True):
-            i, j, share = _same_moment(best, chain, at)
+            i, j, share = same_moment(best, chain, at)
             colors = self.colors(_blend(chain.defects, i, j, share)[1:])
             colors[:, 3] = 1.0 if chain is best else _OTHER
             yield (1.0 - share) * its_points[i] + share * its_points[j], colors
@@ -314,7 +314,7 @@ def _robot_pictures(
 
 def _task_pictures(film: Film, draw: Draw, x_init: Floats) -> Iterator[Frame]:
     """The chains' paths on what a task draws."""
-    points = [_traced(draw, chain.x.astype(float)) for chain in film.shown]
+    points = [traced(draw, chain.x.astype(float)) for chain in film.shown]
     width, height = film.size
     canvas = Canvas(height, width, layout="constrained")
     axes = canvas.figure.add_subplot()
@@ -352,7 +352,7 @@ def _task_pictures(film: Film, draw: Draw, x_init: Floats) -> Iterator[Frame]:
         yield with_paths(background, film.moments[-1], 0.35)
 
 
-def _traced(draw: Draw, states: Floats) -> Floats:
+def traced(draw: Draw, states: Floats) -> Floats:
     """Where `draw` puts states (..., nx) on its axes, (..., 2): the line with a vertex for each."""
     axes, flat = Figure().add_subplot(), states.reshape(-1, states.shape[-1])
     draw(axes, flat)

@@ -56,7 +56,7 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
             "velocities is unknown. Give one with a model, or with two states."
         )
     plan = solution.plans[solution.best_chain].astype(float)
-    phases = [_phases(dynamics, states) for states in (plan, finite(solution.replayed[0]))]
+    phases = [phases_of(dynamics, states) for states in (plan, finite(solution.replayed[0]))]
     known = coordinates(dynamics)
     panels = [
         partial(_draw_phase, label=label, motions=[(q[:, i], v[:, i]) for q, v in phases])
@@ -134,7 +134,7 @@ def has_phases(dynamics: Dynamics) -> bool:
     return mujoco_model(dynamics) is not None or dynamics.nx == 2
 
 
-def _phases(dynamics: Dynamics, states: Floats) -> tuple[Floats, Floats]:
+def phases_of(dynamics: Dynamics, states: Floats) -> tuple[Floats, Floats]:
     """Positions and velocities (T, nv) of states (T, nx), in tangent space."""
     model = mujoco_model(dynamics)
     if model is None:

@@ -70,15 +70,15 @@ def plot_solution(
     panels: list[Panel] = []
     if draw is not None:
         panels.append(partial(_draw_scene, solution=solution, draw=draw))
-    panels += [partial(curves.draw, times=times, mode=mode) for curves in _motion(solution)]
+    panels += [partial(curves.draw, times=times, mode=mode) for curves in motion_curves(solution)]
     of_polish = [_draw_residuals] * bool(np.isfinite(residuals(solution.history)).any())
     panels += [
         partial(draw_chains, solution=solution)
-        for draw_chains in (_draw_defects, _draw_costs, *of_polish, _draw_final_costs)
+        for draw_chains in (draw_defects, _draw_costs, *of_polish, _draw_final_costs)
     ]
     color = BLACK if solution.certified else VERMILLION
     figure = panel_figure(panels, 2, (4.0, 2.6), fill=True)
-    figure.suptitle(_title(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
+    figure.suptitle(title_of(solution), fontsize=9, color=color, linespacing=1.4, parse_math=False)
     return save_figure(figure, path)
 
 
@@ -169,7 +169,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def _title(solution: Solution) -> str:
+def title_of(solution: Solution) -> str:
+    """The verdict, the numbers of the best chain, and what its replays did, a line each."""
     chain, certificate = solution.best_chain, solution.certificate
     return "\n".join(
         [
@@ -277,7 +278,7 @@ class Curves:
         axes.set_title(f"plan dashed, replay ({mode}) solid", loc="right", fontsize=7, color=GRAY)
 
 
-def _motion(solution: Solution) -> list[Curves]:
+def motion_curves(solution: Solution) -> list[Curves]:
     """States, then controls, of the best chain."""
     problem, best = solution.problem, solution.best
     plan = np.vstack([problem.x_init, best.x])
@@ -338,7 +339,8 @@ def _draw_history(
     return [*handles, band]
 
 
-def _draw_defects(axes: Axes, solution: Solution) -> None:
+def draw_defects(axes: Axes, solution: Solution) -> None:
+    """max|h| of all chains over the iterations, and where attempts began."""
     values = solution.history["max_defect"]
     handles = _draw_history(axes, solution, values, np.ones_like(values, bool), BLUE)
     _draw_limit(axes, "max|h| of all chains", "feasible", FEASIBLE, handles)

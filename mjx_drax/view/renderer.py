@@ -36,7 +36,7 @@ class Renderer(Protocol):
 @contextlib.contextmanager
 def open_renderer(model: mujoco.MjModel, height: int, width: int) -> Iterator[Renderer]:
     """A renderer with OpenGL if this machine has it, else the software renderer."""
-    context = _gl_context()
+    context = gl_context()
     if context is None:
         from mjx_drax.view.software_renderer import SoftwareRenderer  # imports Pillow
 
@@ -105,7 +105,7 @@ def _is_software() -> bool:
 
 
 @lru_cache(maxsize=1)
-def _gl_context() -> Callable[[int, int], Any] | None:
+def gl_context() -> Callable[[int, int], Any] | None:
     """The first kind of OpenGL context that works here; None, with one warning, if none does."""
     failures = []
     for platform_name in _gl_platforms():

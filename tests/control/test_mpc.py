@@ -84,13 +84,13 @@ def policy(solved):
 
 def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
     x = np.array([0.5, 0.0])
-    before = policy._planner._cache_size()
+    before = policy.planner._cache_size()
     for k in range(60):
         x = stepped(x, policy(x, k * DT))
         if k == 20:
             x = x + np.array([0.1, -0.8])
     assert np.abs(x).max() < 0.02
-    assert policy._planner._cache_size() == before
+    assert policy.planner._cache_size() == before
     assert policy.statistics.plans == 59
     assert policy.statistics.failed == 0
     assert np.median(policy.statistics.max_defects) < 1e-4
@@ -147,8 +147,8 @@ def test_between_plans_the_feedback_acts_about_the_interpolated_plan(policy):
 
 
 def test_what_is_not_finite_changes_nothing_and_is_counted(policy, monkeypatch):
-    t, shifts, plan = DT, [], policy._planner
-    monkeypatch.setattr(policy, "_planner", lambda *a: shifts.append(float(a[2].by)) or plan(*a))
+    t, shifts, now = DT, [], mpc.Now
+    monkeypatch.setattr(mpc, "Now", lambda **new: shifts.append(float(new["by"])) or now(**new))
     u = policy([np.nan, 0.0], t)
     np.testing.assert_allclose(u, policy.latest.u[1])
     assert policy.statistics.unmeasured == 1

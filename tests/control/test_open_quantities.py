@@ -136,14 +136,14 @@ def test_rates_stay_within_their_bounds_from_control_to_control(every):
     problem = limited()
     policy = MPC(problem, chains=4, explorers=1, hold=1.0, every=every, solver=FAST)
     policy.reset(np.zeros(2))
-    compiled, x, u = policy._planner._cache_size(), np.zeros(2), [0.0]
+    compiled, x, u = policy.planner._cache_size(), np.zeros(2), [0.0]
     for k in range(60):
         u.append(policy(x, k * DT).item())
         x = x + DT * np.array([x[1], u[-1]]) + (np.array([0.1, -0.3]) if k == 20 else 0.0)
     assert np.abs(np.diff(u) / DT).max() < 4.0 + 1e-4
     np.testing.assert_allclose(x, GOAL, atol=0.02)
     assert max(policy.statistics.max_defects) < 1e-4
-    assert policy._planner._cache_size() == compiled
+    assert policy.planner._cache_size() == compiled
 
 
 @pytest.mark.slow

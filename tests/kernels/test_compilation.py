@@ -16,10 +16,10 @@ from mjx_drax.kernels.compilation import compiled
 def _asked_anew():
     hurry = jax.config.values["jax_disable_most_optimizations"]
     jax.config.update("jax_disable_most_optimizations", False)
-    compilation._options.cache_clear()
+    compilation.known_options.cache_clear()
     yield
     jax.config.update("jax_disable_most_optimizations", hurry)
-    compilation._options.cache_clear()
+    compilation.known_options.cache_clear()
 
 
 def doubled(x, times=1):
@@ -30,7 +30,7 @@ def doubled(x, times=1):
 def test_the_compiler_gets_options_that_it_knows(monkeypatch, backend):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     options = compilation.OPTIONS[backend]
-    assert compilation._options() == options
+    assert compilation.known_options() == options
     given, plain = [], jax.jit
     monkeypatch.setattr(jax, "jit", lambda f, **rest: given.append(rest) or plain(f, **rest))
     program = compiled(doubled, static_argnames="times")
@@ -42,12 +42,12 @@ def test_the_compiler_gets_options_that_it_knows(monkeypatch, backend):
 
 def test_there_are_no_options_where_jax_is_told_to_hurry():
     jax.config.update("jax_disable_most_optimizations", True)
-    assert compilation._options() is None
+    assert compilation.known_options() is None
 
 
 def test_an_option_that_the_compiler_does_not_know_is_left_out(monkeypatch):
     monkeypatch.setitem(compilation.OPTIONS, "cpu", {"xla_gpu_no_such_option": False})
-    assert compilation._options() is None
+    assert compilation.known_options() is None
     assert compiled(doubled)(3.0) == 6.0
 
 

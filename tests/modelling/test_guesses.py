@@ -40,7 +40,7 @@ PROBLEM = arm()
 LOW, HIGH, BACK = np.array([[-0.4, 0], [0.2, 3], [0, -1.0]])
 
 
-def turning():
+def turning(x_scatter=(-2, 2)):
     """A model with a free and a ball joint."""
     xml = """
     <mujoco model="turning"><worldbody>
@@ -56,7 +56,7 @@ def turning():
         running_residual=lambda data, u: u,
         x_bounds=([-1] + [-np.inf] * 21, [1] + [np.inf] * 21),
         u_bounds=(-1, 1),
-        x_scatter=(-2, 2),
+        x_scatter=x_scatter,
         contacts=False,
     )
 
@@ -142,8 +142,8 @@ def test_controls_without_an_answer_are_the_middle_of_their_bounds():
 
 def test_quaternions_turn_about_one_axis_and_stay_unit():
     problem, end = turning(), np.zeros(12)
-    model, axis = problem.dynamics.mj_model, np.array([0, 0.6, 0.8])
-    end[1:4], quaternion = [1, 2, 3], np.zeros(4)
+    axis, quaternion = np.array([0, 0.6, 0.8]), np.zeros(4)
+    end[1:4] = [1, 2, 3]
     end[4], end[8] = 5, 1  # of any length
     mujoco.mju_axisAngle2Quat(quaternion, axis, 2.0)
     end[8:12] = -quaternion  # of any sign
@@ -158,8 +158,16 @@ def test_quaternions_turn_about_one_axis_and_stay_unit():
     close(np.linalg.norm(q[..., 8:12], axis=-1), 1)
     close(np.linalg.norm(q[..., 4:8], axis=-1), 1)
     assert np.abs(q[1:, -1, 8:12] @ end[8:12]).max() < 0.999
-    widths = np.arange(len(problem.x_init))
-    close(guesses._per_dof(model, widths, 7.0), [0, 1, 2, 3, 7, 7, 7, 7, 7, 7])
+
+
+def test_a_spread_is_as_wide_as_the_scatter_and_turns_by_angles():
+    """Velocities add up to how far each coordinate has gone; no entry of x_scatter is an angle."""
+    widths = 1.0 + np.arange(22)
+    problem = turning((-widths, widths))
+    batch = guesses.spread(problem, guesses.still(problem), 300, scale=0.3)
+    gone = 0.1 * np.asarray(batch.x)[..., 12:].sum(axis=1)
+    expected = 0.3 * np.array([1.0, 2.0, 3.0, 4.0, *6 * [np.pi]])
+    np.testing.assert_allclose(gone.std(axis=0), expected, rtol=0.1)
 
 
 def test_a_spread_is_smooth_begins_together_and_keeps_the_bounds():

@@ -163,5 +163,5 @@ def test_a_cause_is_looked_for_with_pairs_of_contacts_that_are_named(monkeypatch
         return SimpleNamespace(velocity=np.ones(1))
 
     monkeypatch.setattr(checks, "compare", compare)
-    cause = checks._causes(model, None, [("ball", "floor")], np.zeros(0), 1.0)
+    cause = checks.causes(model, None, [("ball", "floor")], np.zeros(0), 1.0)
     assert cause == "the reason is not known"

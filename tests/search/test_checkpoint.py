@@ -360,10 +360,10 @@ def test_damaged_files_are_refused(written, whole, tmp_path):
     for place in np.random.default_rng(0).integers(0, len(content), 40):
         file.write_bytes(content[:place] + bytes([content[place] ^ 255]) + content[place + 1 :])
         try:
-            found, question = checkpoint._read(file)
+            found, question = checkpoint.read(file)
         except DraxError:
             continue
-        assert_same((found, question), checkpoint._read(written))  # a date, or the like
+        assert_same((found, question), checkpoint.read(written))  # a date, or the like
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def overlap(compiles):
     return max(most)
 
 assert overlap(False) == overlap(True) == count
-devices._cached = lambda: True  # as on GPUs: the others find what the first one compiled
+jax.default_backend = lambda: "gpu"  # where the others find what the first one compiled
 assert overlap(False) == count and overlap(True) == 1
 """
 

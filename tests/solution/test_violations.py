@@ -276,7 +276,7 @@ def test_a_constraint_that_a_replay_breaks_is_told_everywhere(tmp_path):
     assert f"with feedback  {broken}, cost 10" in lines(made)
     assert "NOT CERTIFIED: feasible chains miss the goal or break" in lines(made)[-1]
     assert broken in " ".join(outcome_lines(made))
-    assert broken in " ".join(plotting._title(made).split())
+    assert broken in " ".join(plotting.title_of(made).split())
     made.save(tmp_path)
     told = json.loads((tmp_path / "result.json").read_text())
     kept = told["certificate"]["feedback"]["violations"]

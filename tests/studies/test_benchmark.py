@@ -68,10 +68,10 @@ def test_shooting_nears_the_optimum(method):
 
 
 def test_samples_are_correlated_in_time_and_have_unit_variance():
-    L = np.asarray(shooting._smoother(0.8, 6))
+    L = np.asarray(shooting.smoother(0.8, 6))
     lag = np.abs(np.subtract.outer(range(6), range(6)))
     np.testing.assert_allclose(L @ L.T, 0.8**lag, atol=1e-6)
-    np.testing.assert_allclose(shooting._smoother(0.0, 4), np.eye(4))
+    np.testing.assert_allclose(shooting.smoother(0.0, 4), np.eye(4))
 
 
 def test_diffusion_noise_is_that_of_the_product_of_alphas():

@@ -199,7 +199,7 @@ def test_ipopt_gets_the_derivatives_of_the_whole_program(make):
     z, forces = rng.normal(size=program.size), rng.normal(size=program.rows)
 
     def values(z):
-        return ipopt_jax._values(program._numbers, program.knots(z))
+        return ipopt_jax.cost_and_constraints(program.problem, program.knots(z))
 
     def dense(pattern, entries, rows):
         out = np.zeros((rows, program.size))

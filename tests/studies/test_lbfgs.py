@@ -36,9 +36,9 @@ def test_n_pairs_of_a_quadratic_give_its_inverse(problem, metric):
     for s in conjugate.T:
         y = hessian @ s
         pair = (jnp.asarray(v, jnp.float32) for v in (s, y, s @ y))
-        memory = metric._with_pair(memory, *pair, jnp.asarray(True))
+        memory = metric.with_pair(memory, *pair, jnp.asarray(True))
     gradient = np.arange(1.0, n + 1.0)
-    step = metric._inverse_times(memory, jnp.asarray(gradient, jnp.float32))
+    step = metric.inverse_times(memory, jnp.asarray(gradient, jnp.float32))
     np.testing.assert_allclose(step, np.linalg.solve(hessian, gradient), rtol=2e-3, atol=2e-3)
 
 
@@ -49,6 +49,6 @@ def test_a_full_matrix_without_descent_begins_anew(problem):
     s = jnp.zeros(n).at[0].set(1.0)
     gradient = jnp.ones(n)  # s goes uphill
     lost = replace(memory, inverse=-jnp.eye(n), scale=jnp.asarray(0.5), gradient=gradient)
-    memory = metric._with_pair(lost, s, -2.0 * s, jnp.asarray(1.0), jnp.asarray(False))
-    np.testing.assert_allclose(metric._inverse_times(memory, gradient), 0.5 * gradient)
-    np.testing.assert_allclose(jnp.linalg.norm(metric._inverse_times(memory, 1e6 * gradient)), 10.0)
+    memory = metric.with_pair(lost, s, -2.0 * s, jnp.asarray(1.0), jnp.asarray(False))
+    np.testing.assert_allclose(metric.inverse_times(memory, gradient), 0.5 * gradient)
+    np.testing.assert_allclose(jnp.linalg.norm(metric.inverse_times(memory, 1e6 * gradient)), 10.0)

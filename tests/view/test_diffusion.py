@@ -99,7 +99,7 @@ def test_film_of_a_model(
     cartpole: Solution, painted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if painted:
-        monkeypatch.setattr(renderer, "_gl_context", lambda: None)
+        monkeypatch.setattr(renderer, "gl_context", lambda: None)
     path = render_diffusion(
         cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(240, 180), ghosts=4
     )
@@ -131,10 +131,10 @@ def test_paths_are_where_the_task_draws_them() -> None:
         axes.plot(10 * states[:, 1], states[:, 0])
 
     states = np.random.default_rng(0).normal(size=(3, 4, 2))
-    points = diffusion._traced(draw, states)
+    points = diffusion.traced(draw, states)
     np.testing.assert_array_equal(points, states[..., ::-1] * [10, 1])
     with pytest.raises(DraxError, match="one vertex for each state"):
-        diffusion._traced(lambda axes, states: None, states)
+        diffusion.traced(lambda axes, states: None, states)
 
 
 def test_colors_go_from_feasible_to_the_worst() -> None:
@@ -157,7 +157,7 @@ def test_film_time_is_spent_where_knots_move() -> None:
         x=x,
         defects=x[..., 0],
     )
-    at = diffusion._moments(path, 4.0, 25.0)
+    at = diffusion.frame_moments(path, 4.0, 25.0)
     assert (at[0], at[-1]) == (0.0, 20.0)
     assert (np.diff(at) >= 0.0).all()
     assert np.median(at) < 5.0
@@ -180,12 +180,12 @@ def _timeline(iteration: list[int], attempt: list[int]) -> recording.Path:
 def test_other_chains_are_shown_at_the_same_time() -> None:
     one = _timeline([0, 2, 4, 4, 6], [0, 0, 0, 1, 1])
     early, late = _timeline([0, 4], [0, 0]), _timeline([0, 4, 4, 8, 8, 12], [0, 0, 1, 1, 2, 2])
-    assert diffusion._same_moment(one, late, 0.5) == (0, 1, 0.25)
-    assert diffusion._same_moment(one, late, 2.0) == (1, 1, 0.0)  # its first attempt ends as well
-    assert diffusion._same_moment(one, late, 3.0) == (2, 3, 0.0)  # the second begins
-    assert diffusion._same_moment(one, late, 3.5) == (2, 3, 0.25)
-    assert diffusion._same_moment(one, late, 4.0) == (5, 5, 0.0)  # its answer
-    assert diffusion._same_moment(one, early, 3.5) == (1, 1, 0.0)
+    assert diffusion.same_moment(one, late, 0.5) == (0, 1, 0.25)
+    assert diffusion.same_moment(one, late, 2.0) == (1, 1, 0.0)  # its first attempt ends as well
+    assert diffusion.same_moment(one, late, 3.0) == (2, 3, 0.0)  # the second begins
+    assert diffusion.same_moment(one, late, 3.5) == (2, 3, 0.25)
+    assert diffusion.same_moment(one, late, 4.0) == (5, 5, 0.0)  # its answer
+    assert diffusion.same_moment(one, early, 3.5) == (1, 1, 0.0)
 
 
 def test_what_cannot_be_filmed(trapped: Solution, cartpole: Solution, tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_draw_adds_a_panel_of_the_replayed_motion(pendulum: Solution, tmp_path: 
 
 def test_model_names_joints_and_actuators(cartpole: Solution, tmp_path: Path) -> None:
     assert _size(plot_solution(cartpole, tmp_path / "cartpole.png")) == (1200, 1290)
-    positions, velocities, controls = plotting._motion(cartpole)
+    positions, velocities, controls = plotting.motion_curves(cartpole)
     assert positions.labels == ["slider [m]", "pole [rad]"]
     assert velocities.labels == ["slider [m/s]", "pole [rad/s]"]
     assert controls.labels == ["force"]
@@ -118,17 +118,17 @@ def test_diverged_chains_and_replays(pendulum: Solution, kind: str, tmp_path: Pa
     bad = replace(bad, open_loop=lost, feedback=lost)
     assert not bad.certified
     assert bad.outcome(WITH_FEEDBACK) == "diverges"
-    assert "NOT CERTIFIED" in plotting._title(bad)
+    assert "NOT CERTIFIED" in plotting.title_of(bad)
     assert _size(plot_solution(bad, tmp_path / "bad.png")) == (1200, 1290)
 
 
 def test_title_tells_what_the_replays_did(pendulum: Solution) -> None:
-    lines = plotting._title(pendulum).split("\n")
+    lines = plotting.title_of(pendulum).split("\n")
     chain = pendulum.best_chain
     assert f"cost {pendulum.replay_cost[chain]:.4g} (plan {pendulum.cost[chain]:.4g})" in lines[1]
     assert f"residual {pendulum.residual[chain]:.1e}, below 0.0001" in lines[1]
     unknown = replace(pendulum, residual=np.full(8, np.nan))
-    assert "residual not known" in plotting._title(unknown)
+    assert "residual not known" in plotting.title_of(unknown)
     assert lines[0] == f"{pendulum.problem.name}: {pendulum.verdict}"
     assert f"max|h| {pendulum.max_defect[chain]:.1g}" in lines[1]
     assert f"{pendulum.success_rate:.0%} of 8 chains" in lines[1]
@@ -175,7 +175,7 @@ def test_phase_plots_of_turns_are_in_tangent_space(quadrotor: Dynamics) -> None:
     states = np.zeros((5, 13))
     states[:, 0], states[:, 12] = 2.0, 1.5
     states[:, 3], states[:, 6] = np.cos(angle / 2), np.sin(angle / 2)
-    positions, velocities = phase_plots._phases(quadrotor, states)
+    positions, velocities = phase_plots.phases_of(quadrotor, states)
     np.testing.assert_allclose(positions[:, 5], angle, atol=1e-9)
     np.testing.assert_array_equal(positions[:, 0], 2.0)
     np.testing.assert_array_equal(velocities[:, 5], 1.5)
@@ -200,6 +200,6 @@ def test_marks_are_where_attempts_began(pendulum: Solution) -> None:
     began, ended = np.array([0, 31]), np.array([0, 44])
     marked = replace(pendulum, history={**pendulum.history, "began": began, "noise_ends": ended})
     axes = Figure().add_subplot()
-    plotting._draw_defects(axes, marked)
+    plotting.draw_defects(axes, marked)
     marks = {line.get_xdata()[0] for line in axes.lines if len(set(line.get_xdata())) == 1}
     assert marks == {31, 44}

@@ -35,7 +35,7 @@ def _model(name: str) -> mujoco.MjModel:
 def _has_opengl() -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return renderer._gl_context() is not None
+        return renderer.gl_context() is not None
 
 
 def _amber(frame: np.ndarray) -> np.ndarray:
@@ -77,15 +77,15 @@ def _judged(solution: Solution, feasible: bool, open_loop: bool, feedback: bool)
 
 @pytest.fixture(autouse=True)
 def _fresh_choice() -> Iterator[None]:
-    renderer._gl_context.cache_clear()
+    renderer.gl_context.cache_clear()
     yield
-    renderer._gl_context.cache_clear()
+    renderer.gl_context.cache_clear()
 
 
 @pytest.fixture(params=["opengl", "software"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "software":
-        monkeypatch.setattr(renderer, "_gl_context", lambda: None)
+        monkeypatch.setattr(renderer, "gl_context", lambda: None)
     elif not _has_opengl():
         pytest.skip("no OpenGL on this machine")
     return str(request.param)
@@ -225,7 +225,7 @@ def test_software_rendering_agrees_with_opengl(name: str, monkeypatch: pytest.Mo
     poses = np.linspace(0.0, 2.5, 4)[:, None] * np.ones(model.nq)
     poses[:, 0] = np.minimum(poses[:, 0], 1.8) if name == "cartpole" else poses[:, 0]
     opengl = video.render_frames(model, poses, range(4), fps=1)
-    monkeypatch.setattr(renderer, "_gl_context", lambda: None)
+    monkeypatch.setattr(renderer, "gl_context", lambda: None)
     without = video.render_frames(model, poses, range(4), fps=1)
     for one, other in zip(_amber(opengl), _amber(without), strict=True):
         assert np.sum(one & other) > 0.7 * np.sum(one | other)
@@ -524,11 +524,9 @@ def test_bad_input_is_refused_before_drawing(tmp_path: Path) -> None:
 
 
 def test_without_opengl_one_warning_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(name: str) -> None:
-        raise ImportError(f"no {name}")
-
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(renderer, "_tried_context", fail)
+    for name in ("egl", "osmesa", "cgl", "glfw"):
+        monkeypatch.setitem(sys.modules, f"mujoco.{name}", None)  # cannot be imported
     motion = (_model("pendulum"), [[0.0]], [0.0])
     with pytest.warns(RuntimeWarning, match="apt-get install.*libegl1") as caught:
         twice = [video.render_frames(*motion, fps=2, size=(WIDTH, HEIGHT)) for _ in range(2)]

@@ -430,7 +430,7 @@ def _examined(
             "hulls of meshes touch in all states where it does, and in none of the others; choose "
             'contacts=[("foot_*", "floor"), ...] without them, or plan with contacts=False'
             if of_hulls
-            else _causes(model, at, contacts, bounded, error)
+            else causes(model, at, contacts, bounded, error)
         )
         words = (
             f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
@@ -453,7 +453,7 @@ def _where_hulls_touch(engine: Engine, at: Samples, errors: StepErrors) -> bool:
     )
 
 
-def _causes(
+def causes(
     model: mujoco.MjModel,
     at: Samples,
     contacts: Contacts,

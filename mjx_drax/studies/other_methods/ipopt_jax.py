@@ -209,7 +209,7 @@ class Program:
 
     def values(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cost, scalar, and constraints, (rows,)."""
-        cost, constraints = _values(self._numbers, self.knots(z))
+        cost, constraints = cost_and_constraints(self._numbers, self.knots(z))
         return np.asarray(cost), np.asarray(constraints)
 
     def gradient(self, z: np.ndarray) -> np.ndarray:
@@ -295,7 +295,8 @@ def _constraints(problem: Problem, y: Array, knot: Knot) -> Array:
 
 
 @jax.jit
-def _values(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
+def cost_and_constraints(problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
+    """Cost, scalar, and constraints, (rows,), in the order of `Program`."""
     found = jax.vmap(partial(_constraints, problem))(*_stages(problem, knots))
     nx = problem.dynamics.nx
     defects = found[:, :nx] - knots.x

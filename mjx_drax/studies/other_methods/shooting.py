@@ -148,7 +148,7 @@ def advance(
     """Iterations start..stop-1, of `total`, of every run (plans and keys lead with that axis)."""
     centre, half = _box(problem)
     K, nu = problem.horizon, problem.dynamics.nu
-    smooth = _smoother(method.correlation, K)
+    smooth = smoother(method.correlation, K)
 
     def one(plan: Plan, key: Array, i: Array) -> Plan:
         e = jax.random.normal(jax.random.fold_in(key, i), (samples, K, nu)).at[0].set(0.0)
@@ -204,7 +204,7 @@ def _penalized(problem: Problem, knots: Trajectory) -> Array:
     return problem.cost(knots) + WALL * jnp.sum(jnp.square(out))
 
 
-def _smoother(r: ArrayLike, K: int) -> Array:
+def smoother(r: ArrayLike, K: int) -> Array:
     """Lower triangular L (K, K) with L L' = r^|k - j|."""
     k = jnp.arange(K)
     powers = jnp.tril(jnp.asarray(r, float) ** jnp.maximum(k[:, None] - k, 0))
