@@ -32,8 +32,8 @@ def require_plannable(problem: Problem) -> None:
     mjx = mjx_dynamics(dynamics)
     if mjx is not None and mjx.numbers is not None:
         raise DraxError(
-            f"{name} chooses numbers of the model, and MPC drives a robot that has its own: give a "
-            "problem with the model that solution.parameters describe, without model_numbers."
+            f"{name} has model_numbers, and MPC cannot change the robot that it drives: give a "
+            "problem without them, of the model that solution.parameters describe."
         )
     if len(own.phases) > 1:
         raise DraxError(

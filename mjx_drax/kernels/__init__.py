@@ -1,4 +1,4 @@
-"""Speed and nothing else: arrays in, arrays out, each kernel with a plain twin."""
+"""Speed and nothing else: arrays in, arrays out; each kernel is there in plain JAX too."""
 
 from mjx_drax.base.rooms import by_name
 

@@ -198,7 +198,7 @@ def iterated(
             return change, sizes * second - first + slope
 
         change, slope = tried(sizes)
-        size, least = _level(sizes, slope, -first), jnp.min(change)
+        size, least = _where_flat(sizes, slope, -first), jnp.min(change)
         between, _ = tried(size)
         on_ladder = jnp.max(jnp.where(change == least, sizes, 0.0))
         inside = between < least
@@ -216,7 +216,7 @@ def iterated(
     return a0 + end[2], end[-1]
 
 
-def _level(sizes: Array, slopes: Array, slope: Array) -> Array:
+def _where_flat(sizes: Array, slopes: Array, slope: Array) -> Array:
     """Where a convex function's slope is about 0, from those at 0 and at falling sizes (n,)."""
     rises = slopes > 0.0
     far = jnp.min(jnp.where(rises, sizes, 2.0))

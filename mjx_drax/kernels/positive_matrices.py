@@ -26,7 +26,7 @@ MAX_SIZE = 12
 def factors(M: Array, interpret: bool = False) -> Array:
     """Lower triangular L, (rows, n, n), with L L' = M, of which lower triangles are read.
 
-    The plain twin is the vmap of `linalg.cholesky`.
+    In plain JAX it is the vmap of `linalg.cholesky`.
     """
     rows, n, _ = M.shape
 
@@ -44,7 +44,7 @@ def factors(M: Array, interpret: bool = False) -> Array:
 def solutions(M: Array, b: Array, interpret: bool = False) -> Array:
     """M^{-1} b, (rows, n, m), for M (rows, n, n), of which lower triangles are read, and b.
 
-    The plain twin is the vmap of `linalg.solve_positive`.
+    In plain JAX it is the vmap of `linalg.solve_positive`.
     """
     rows, n, m = b.shape
 

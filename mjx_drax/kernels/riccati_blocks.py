@@ -49,7 +49,7 @@ def newton_steps(
 ) -> dict[str, Array | None]:
     """Newton step, noise and feedback of many chains, as `riccati_gpu.newton_steps` returns them.
 
-    The plain twin is `method.riccati.newton`.
+    In plain JAX it is `method.riccati.newton`.
     """
     chains, K, n, m = B.shape
     N, M = tile(n), tile(m)
@@ -62,10 +62,10 @@ def newton_steps(
         full = {k: (chains, K, *s) for k, s in shapes.items()}
         return block_for_each_row(body, full, arrays, WARPS, interpret)
 
-    exact = partial(product, precision=lax.Precision.HIGHEST if interpret else SPLIT)
+    multiply = partial(product, precision=lax.Precision.HIGHEST if interpret else SPLIT)
     shapes = {"K": (M, N), "kff": (M,), "Q": (M, M), "T": (N, N), "P": (N, N), "p": (N,)}
     given = soft, A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu
-    left = launch(partial(backward, K, n, m, exact), shapes, *given)
+    left = launch(partial(backward, K, n, m, multiply), shapes, *given)
     factors = [left[name] for name in ("K", "kff", "T", "P", "p")]
     shapes = {"dx": (N,), "du": (M,), "rate": (N,)}
     white = []
@@ -197,6 +197,6 @@ def tile(n: int) -> int:
 
 def padded(a: Array, *sizes: int) -> Array:
     """Blocks (..., *shape) with zeros around, up to `sizes`."""
-    lead = a.ndim - len(sizes)
-    more = [size - there for size, there in zip(sizes, a.shape[lead:], strict=True)]
-    return jnp.pad(a, [(0, 0)] * lead + [(0, by) for by in more])
+    batch = a.ndim - len(sizes)
+    more = [size - there for size, there in zip(sizes, a.shape[batch:], strict=True)]
+    return jnp.pad(a, [(0, 0)] * batch + [(0, by) for by in more])

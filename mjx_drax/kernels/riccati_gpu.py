@@ -106,7 +106,7 @@ def newton_steps(
     xi_e: Array | None = None,
     interpret: bool = False,
 ) -> dict[str, Array | None]:
-    """Newton step, noise and feedback of many chains (the plain twin: `method.riccati.newton`).
+    """Newton step, noise and feedback of many chains (in plain JAX: `method.riccati.newton`).
 
     Args:
         A: (chains, K, ndx, ndx); B (chains, K, ndx, nu) and h (chains, K, ndx) likewise.

@@ -11,8 +11,8 @@ dz, multipliers nu, and a barrier on s with slope b and curvature c (damping inc
 
 is minimized over ds by ds = -(b + nu_g + mu r_g + mu G dz) / D with D = mu + c, elementwise. What
 is left for dz has gradient J'(nu + mu r) - G'(mu / D) t, where t = b + nu_g + mu r_g, and Hessian
-J'W J, W = mu for equalities and mu c / D for inequalities: an inequality weighs in as its slack
-nears zero. Given dz, ds has variance 1/D under N(0, M^{-1}).
+J'W J, W = mu for equalities and mu c / D for inequalities: an inequality matters more as
+its slack goes to zero. Given dz, ds has variance 1/D under N(0, M^{-1}).
 """
 
 from __future__ import annotations

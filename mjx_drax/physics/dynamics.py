@@ -25,7 +25,7 @@ from mjx_drax.base.pytrees import HostOnly
 from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
-from mjx_drax.physics.c_engine.states import difference, integrate, set_state
+from mjx_drax.physics.c_engine.states import differences, integrate, set_state
 from mjx_drax.physics.c_engine.stepper import Stepper
 from mjx_drax.physics.contacts.collision import left_out
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
@@ -333,7 +333,7 @@ class MjxDynamics(Dynamics):
         if self.nx == self.ndx:
             return np.asarray(x - y)
         rows = (a.reshape(-1, self.nx) for a in np.broadcast_arrays(x, y))
-        off = np.stack([difference(self.mj_model, *pair) for pair in zip(*rows, strict=True)])
+        off = differences(self.mj_model, *rows)
         return off.reshape(*np.broadcast_shapes(x.shape, y.shape)[:-1], self.ndx)
 
     def host_integrate(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:

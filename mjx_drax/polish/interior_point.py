@@ -63,7 +63,7 @@ ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
 """Share of what is promised that a step must bring; the first funnel, and the factor when used."""
 
 DAMPED = 1e-2
-"""First damping after a flow: with none, chains leap out of the basin that it has found."""
+"""First damping after a flow. Without it the first steps leave the basin that the flow found."""
 
 STATE_DAMPING = 1e-2
 """Damping of states beside that of controls: D is the largest along the motion, and often that of
@@ -72,11 +72,15 @@ the end."""
 LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
 """Sizes of steps that are tried at once, as shares of the way to the boundary."""
 
-LESS, MORE, LEAST, MOST = 1 / 3, 8.0, 1e-4, 1e8
-"""Factors on the damping; damping below LEAST times `LESS`^8 is none, above MOST a chain stalls."""
+LESS_DAMPING, MORE_DAMPING = 1 / 3, 8.0
+"""Factors on the damping after a good step, and after a poor one."""
 
-HALF, SHORT = 0.5, 0.25
-"""Where curvature is learned: steps up to HALF keep the damping, steps up to SHORT raise it."""
+LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e8
+"""Damping is raised from 0 to the first, becomes 0 eight good steps below it, and beyond the second
+the chain stalls."""
+
+KEEPS_DAMPING, RAISES_DAMPING = 0.5, 0.25
+"""Where curvature is learned: the longest steps that keep the damping, and that raise it."""
 
 INSIDE = 0.99
 """Share of the way to their bounds that controls may be moved to bend a step."""
@@ -167,7 +171,7 @@ class Progress:
 
     @property
     def blocked(self) -> Array:
-        """Whether the chain stands, or nearly so, where it should not."""
+        """Whether its steps are almost 0 although it has not converged."""
         return self.stalled | ((self.size < BLOCKED) & ~self.optimal)
 
     def again(self, barrier: Array) -> Progress:
@@ -401,11 +405,12 @@ def _moved(
     size_v = jnp.where(found, reach_v, 0.0)
     v = jax.tree.map(lambda v, dv: v + jnp.where(found, size_v * dv, 0.0), v, dv)
     v = _held(problem, X, v, rho)
-    lower = jnp.where(damping * LESS < LEAST * LESS**8, 0.0, damping * LESS)
-    higher = jnp.maximum(MORE * damping, LEAST)
+    lower = LESS_DAMPING * damping
+    lower = jnp.where(lower < LEAST_DAMPING * LESS_DAMPING**8, 0.0, lower)
+    higher = jnp.maximum(MORE_DAMPING * damping, LEAST_DAMPING)
     if learned is not None:
-        kept = jnp.where(alpha > SHORT * reach, damping, higher)
-        lower = jnp.where(alpha > HALF * reach, lower, kept)
+        kept = jnp.where(alpha > RAISES_DAMPING * reach, damping, higher)
+        lower = jnp.where(alpha > KEEPS_DAMPING * reach, lower, kept)
     after = jnp.where(found, lower, higher)
     shortfall, present = _worst(left, rows), _worst(model.h, rows)
     loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
@@ -422,7 +427,7 @@ def _moved(
         promise=jnp.where(ok, jnp.abs(promised[0]) / scales.cost, now.promise),
         funnel=jnp.where(parts, NARROWER * now.funnel, now.funnel),
         iterations=now.iterations + 1,
-        stalled=after > MOST,
+        stalled=after > MOST_DAMPING,
     )
     return replace(
         state,
@@ -537,7 +542,7 @@ def _direction(
 
     more = [damping]
     for _ in range(TRIES - 1):
-        more.append(jnp.maximum(MORE * more[-1], LEAST))
+        more.append(jnp.maximum(MORE_DAMPING * more[-1], LEAST_DAMPING))
     if learned is not None:  # the second is without what was learned, no more damping
         more = [damping, *more[:-1]]
     dampings, shares = jnp.stack(more), jnp.arange(TRIES) == 0

@@ -205,7 +205,11 @@ class Extended(Dynamics):
         if stepper is None:
             return rollout.replay(self, plan, u, gains, limits, knots)
         parameters = self.parameters(first.p)
-        steps = np.repeat(first.h, self.phases, axis=1) if self.phases else None
+        steps = None
+        if self.phases:
+            phase = np.repeat(np.arange(len(self.phases)), self.phases)
+            stages = np.broadcast_to(np.asarray(knots.stage, int), u.shape[:2])
+            steps = np.take_along_axis(first.h, phase[stages], axis=1)
 
         def advance(k: int, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if steps is not None or k == 0:

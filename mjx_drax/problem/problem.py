@@ -42,7 +42,7 @@ CLOSE = 0.03
 """Least factor on the scatter of initial knots of chains that start nearer to x_init."""
 
 PARTS = 12.0
-"""In how many parts the box of initial knots is measured: no unit of the user's matters."""
+"""States are measured in this fraction of their box, so that units do not matter."""
 
 
 @register_dataclass
@@ -255,10 +255,10 @@ class Problem:
     def worst(self, values: Values) -> Array:
         """max|h| of values that are known, scalar.
 
-        Defects of the dynamics are measured in `unit`, constraints as the user has them;
+        Defects of the dynamics are measured in `defect_scale`, constraints as the user has them;
         inequalities count where positive.
         """
-        defect = jnp.abs(values.defects / self.unit).max(initial=0.0)
+        defect = jnp.abs(values.defects / self.defect_scale).max(initial=0.0)
         return jnp.maximum(defect, self.worst_constraint(values.constraints))
 
     def worst_constraint(self, values: Stagewise) -> Array:
@@ -278,7 +278,7 @@ class Problem:
         return of(tangent(box.x_upper - box.x_lower)), of(box.u_upper - box.u_lower)
 
     @property
-    def unit(self) -> Array:
+    def defect_scale(self) -> Array:
         """What states are measured in, (ndx,): a twelfth of their box; 1 where it has no width."""
         width = self.widths[0]
         return jnp.where(width > 0.0, width / PARTS, 1.0)
@@ -299,9 +299,8 @@ class Problem:
 
         They are drawn from the scatter box. For a share `near` of the chains the box is shrunk
         towards x_init and the middle of the controls, for each by another factor from `CLOSE` to 1,
-        uniform in its logarithm: far from x_init bodies overlap and forces lose all measure, what
-        floats freely may tumble at any speed, and strong motors throw light arms about. Motions
-        that lead far away are found from afar.
+        uniform in its logarithm: far from x_init bodies overlap, forces become huge, and what
+        floats freely may tumble at any speed. Chains that start far away find motions that go far.
         """
         if self.guess is not None:
             knots = self.guess(key)
@@ -372,23 +371,25 @@ class Problem:
             return self.dynamics.replay(plan, u, gains, limits, knots)
 
     def engine_defects(self, plan: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """|f(x_k, u_k) - x_{k+1}| of one plan, (K, ndx), by what replays: a step from each x_k.
+        """|f(x_k, u_k) - x_{k+1}| of plans, (..., K, ndx), by what replays: a step from each x_k.
 
         Args:
-            plan: x_0..x_K, (K + 1, nx).
-            u: controls, (K, nu).
+            plan: x_0..x_K, (..., K + 1, nx).
+            u: controls, (..., K, nu).
 
         Raises:
             DraxError: the problem was loaded without f.
         """
-        dynamics, steps = self.dynamics, np.stack([plan[:-1], plan[1:]], axis=1).astype(float)
-        free, gains = np.array(np.inf), np.zeros((len(u), 1, dynamics.nu, dynamics.ndx))
+        dynamics, given = self.dynamics, np.asarray(u, float).reshape(-1, 1, self.dynamics.nu)
+        steps = np.stack([plan[..., :-1, :], plan[..., 1:, :]], axis=-2).astype(float)
+        steps = steps.reshape(len(given), 2, dynamics.nx)
+        free, gains = np.array(np.inf), np.zeros((len(given), 1, dynamics.nu, dynamics.ndx))
         with self.arithmetic():
-            knots = jax.tree.map(lambda a: a[:, None], self.knots.at(slice(-1)))
-            given = np.asarray(u, float)[:, None]
+            which = np.tile(np.arange(self.horizon), len(given) // self.horizon)
+            knots = jax.tree.map(lambda a: a[which, None], self.knots.at(slice(-1)))
             ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
         off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
-        return np.nan_to_num(off, nan=np.inf)
+        return np.nan_to_num(off, nan=np.inf).reshape(*u.shape[:-1], dynamics.ndx)
 
     def reached(self, x: np.ndarray, time: float | None = None) -> bool | None:
         """Whether a replay that ends at x (nx,) reaches the goal; None without a goal.

@@ -30,13 +30,13 @@ NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True)
-class Standing:
+class AttemptSoFar:
     """How an attempt at one problem stands.
 
     Attributes:
         owners: for which chain each place works, (places,).
         active: which places still move, (places,).
-        worth, before: costs of places, now and when this was asked last, (places,).
+        cost, before: costs of places, now and when this was asked last, (places,).
         bar: up to which cost chains are done.
         kept: which chains were done before the attempt, (chains,).
         needless: how many chains need not be done.
@@ -45,7 +45,7 @@ class Standing:
 
     owners: np.ndarray
     active: np.ndarray
-    worth: np.ndarray
+    cost: np.ndarray
     before: np.ndarray
     bar: float
     kept: np.ndarray
@@ -56,12 +56,12 @@ class Standing:
     @property
     def near(self) -> np.ndarray:
         """Places that make their chains done, (places,)."""
-        return self.worth <= self.bar
+        return self.cost <= self.bar
 
     @property
     def hopeful(self) -> np.ndarray:
         """Places that do, or that are not sound yet and may, (places,)."""
-        return self.near | np.isinf(self.worth)
+        return self.near | np.isinf(self.cost)
 
     def gained(self, places: np.ndarray) -> int:
         """How many chains these places make done that were not."""
@@ -83,10 +83,11 @@ class Standing:
     def over(self) -> bool:
         """Whether to end the attempt, where a finish will polish the places that are left.
 
-        If enough chains have settled, some of them elsewhere: where each place works for a chain of
-        its own, waiting is the finish. Or if another attempt must be made, and would bring more
-        than waiting. One chain more than came since this was asked last is assumed to come
-        (Laplace's rule of succession), so that a few chains do not decide by chance.
+        First case: enough chains are done, and some have several places. (Where each place works
+        for a chain of its own, the finish is the same as waiting.) Second case: another attempt is
+        needed, and would bring more chains than waiting. Of waiting one chain more is expected than
+        came since this was asked last (Laplace's rule of succession), so that a few chains do not
+        decide by chance.
         """
         if self.missing(self.near & ~self.active) <= 0.0:
             return len(np.unique(self.owners)) < len(self.owners)

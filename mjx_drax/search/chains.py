@@ -58,7 +58,7 @@ class Chains:
         return self.feasible & ~self.missed
 
     @property
-    def worth(self) -> np.ndarray:
+    def sound_cost(self) -> np.ndarray:
         """The cost of what is sound, and infinity of the rest, (rows,)."""
         return np.where(self.sound, self.cost, np.inf)
 
@@ -80,11 +80,11 @@ class Stage:
         owners: for which of its problem's chains each row works, (rows,).
         kept: the best so far of all chains of all problems, (N * chains,); None before any.
         now: where the chunk's chains are, (rows,).
-        before: `now.worth` when it was asked last whether to wait, (rows,).
+        before: `now.sound_cost` when it was asked last whether to wait, (rows,).
         damping: of each row between rollouts, (rows,).
         step: how many of the attempt's iterations are done.
-        ends: of a single problem, `worth` of the places when the latest attempts without and with
-            noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
+        ends: of a single problem, `sound_cost` of the places when the latest attempts without and
+            with noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
         rollouts: how many rollouts, and rounds of them, are done.
         records: iterations done and diagnostics of the rows, for every report of a single problem.
         began: for every attempt, and every start of it, after how many iterations it began and its
@@ -120,7 +120,7 @@ class Stage:
 
 
 def slim(chains: Chains) -> Chains:
-    """The chains with what thousands of problems keep of them: knots and gains."""
+    """The chains with knots and gains alone, to save memory."""
     state = chains.state
     knots = replace(state.trajectory, slack=None)
     nothing: Any = ()
@@ -143,7 +143,7 @@ def improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
 
 
 def finished(kept: Chains, now: Chains) -> Chains:
-    """The chains that were polished on; those kept for which it has ended worse."""
+    """The chains after more polish; as they were kept where that has made them worse."""
     worse = np.where(now.sound, now.cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
     source = np.arange(len(worse)) + len(worse) * ~worse
     state, info = gather((kept.state, kept.info), (now.state, now.info), source)

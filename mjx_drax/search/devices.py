@@ -47,7 +47,7 @@ def mesh_for(count: int, devices: int = 1) -> Mesh | None:
         raise DraxError(
             f"{count} cannot be spread evenly over {processes} processes: give a multiple."
         )
-    if processes > 1:  # meet: the first time they wait for each other for half a minute only
+    if processes > 1:  # synchronize now: the first time they wait for half a minute at most
         multihost_utils.process_allgather(np.zeros(1))
     count //= processes
     if (
@@ -109,7 +109,7 @@ def _cached() -> bool:
     """Whether devices find in JAX's persistent cache what another one compiled: GPUs do."""
     known = jax.config.values
     kept = known["jax_compilation_cache_dir"] and known["jax_enable_compilation_cache"]
-    return bool(kept) and jax.default_backend() == "gpu"  # keys of CPUs' programs hold the device
+    return bool(kept) and jax.default_backend() == "gpu"  # on CPUs its keys hold the device
 
 
 def gathered(tree: Tree, mesh: Mesh | None) -> Tree:
@@ -151,6 +151,7 @@ def _gathered(mesh: Mesh, leaf: Array) -> Array:
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
     if not leaf.is_fully_addressable:
         return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
-    first, *_ = devices = mesh.local_devices  # copied by themselves: `device_put` of all goes
-    shares = [_share(leaf, mesh, device) for device in devices]  # through the host's memory
+    # Shares are copied one by one: `device_put` of the whole goes through the host's memory
+    first, *_ = devices = mesh.local_devices
+    shares = [_share(leaf, mesh, device) for device in devices]
     return jnp.concatenate(jax.device_put(shares, first))

@@ -30,7 +30,7 @@ from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.attempts import (
-    Standing,
+    AttemptSoFar,
     done_up_to,
     noise_is_better,
     owners_of_places,
@@ -77,8 +77,8 @@ STRAGGLERS = 0.0005
 """Share of chains for which the polish of the others does not wait."""
 
 FAR, COOLER, MOST_COOLINGS = 10.0, 0.25, 4
-"""Where noise brings max|h| of most chains to so many times that of the initial knots (or its own
-square), the attempt starts again with so much of the noise, as do those after it; so many times."""
+"""If noise raises max|h| of most chains above FAR times that of the initial knots, or above FAR^2,
+the attempt and those after it start with COOLER times the noise; at most MOST_COOLINGS times."""
 
 Progress = Callable[[int, int, Info], None]
 
@@ -226,7 +226,7 @@ class Search:
             owners=owners,
             kept=kept,
             now=now,
-            before=now.worth,
+            before=now.sound_cost,
             damping=ones,
             step=0,
             ends=np.full((2, self.chains), np.inf),
@@ -245,7 +245,7 @@ class Search:
         return state
 
     def _no_worse(self, found: Chains, guessed: Chains) -> tuple[Chains, np.ndarray]:
-        """What was found; for a chain whose guess was feasible and better, the guess; and which."""
+        """The better of answer and guess for each chain, and where the guess won."""
         inside = np.asarray(guessed.info.max_violation) == 0.0
         better = improved(found, guessed, self.stage.floor[:1]) & inside
         source = np.arange(self.chains) + self.chains * better
@@ -266,9 +266,9 @@ class Search:
         owners = np.tile(np.arange(self.chains), self.size)
         if stage.attempt > 0:
             assert stage.kept is not None
-            assert self.settings.enough is not None
-            cost, bar = self._worth(stage.kept, indices), self._done_up_to(indices)
-            left_alone = (cost <= bar) & (self.settings.enough <= 1.0)
+            assert self.settings.done_share is not None
+            cost, bar = self._sound_costs(stage.kept, indices), self._done_up_to(indices)
+            left_alone = (cost <= bar) & (self.settings.done_share <= 1.0)
             rows = zip(left_alone, cost, strict=True)
             owners = np.concatenate([owners_of_places(*row) for row in rows])
         knots, keys = self._drawn(stage.attempt, indices)
@@ -282,7 +282,7 @@ class Search:
             begun=True,
             owners=owners,
             now=now,
-            before=now.worth,
+            before=now.sound_cost,
             damping=ones,
             step=0,
             rollouts=0,
@@ -312,7 +312,7 @@ class Search:
         ends, steps = stage.ends.copy(), stage.steps.copy()
         if self.family.alone:
             kind = int(stage.heated)
-            ends[kind], steps[kind] = stage.now.worth, max(stage.step, 1)
+            ends[kind], steps[kind] = stage.now.sound_cost, max(stage.step, 1)
         place = min(stage.place + self.size, len(stage.todo))
         self.stage = replace(stage, kept=kept, ends=ends, steps=steps, place=place, begun=False)
         if not self.family.alone:
@@ -325,20 +325,20 @@ class Search:
         """Go on to another attempt, or finish; False if nothing more is to be done.
 
         If attempts are `heated`, the second one is, and later ones of a single problem are if
-        that has brought more chains, or if all are asked for. If that is open (None), those of a
-        single problem are in turns until one has made a chain done, and then what has brought more.
+        that has brought more chains, or if all are asked for. None: for a single problem they take
+        turns until one has made a chain done; then the kind goes on that has brought more.
         In a batch, where answers must not depend on others, all are, or none.
         """
         stage, settings, family = self.stage, self.settings, self.family
         kept, everyone = stage.kept, np.arange(family.count)
         assert kept is not None
-        assert settings.enough is not None
+        assert settings.done_share is not None
         if stage.finishing:
             assert self.polish is not None
             return stage.finishing < self.polish.patience and self._begin_to_finish()
         bar = self._done_up_to(everyone)
-        unfinished = (self._worth(kept, everyone) > bar).sum(axis=1)
-        todo = np.flatnonzero(unfinished > (1.0 - settings.enough) * self.chains)
+        unfinished = (self._sound_costs(kept, everyone) > bar).sum(axis=1)
+        todo = np.flatnonzero(unfinished > (1.0 - settings.done_share) * self.chains)
         if stage.attempt + 1 == settings.attempts or not len(todo):
             return self._begin_to_finish()
         heated = bool(settings.heated)
@@ -372,8 +372,8 @@ class Search:
             place=0,
             owners=np.arange(self.chains),
             now=kept,
-            before=kept.worth,
-            # the first only brings chains inside
+            before=kept.sound_cost,
+            # the first only moves knots inside their bounds
             step=self.flow.iterations + max(done % (self.settings.after - 1), 1),
             began=(*stage.began, (stage.done, stage.done)),
         )
@@ -384,7 +384,7 @@ class Search:
 
     @property
     def _ends_early(self) -> bool:
-        """Whether attempts end early, and a finish follows: not where rollouts mend them."""
+        """Whether attempts end early, and a finish follows: not if rollouts follow."""
         rollouts = self.settings.rollouts
         assert rollouts is not None
         polished = self.polish is not None
@@ -394,8 +394,8 @@ class Search:
     @property
     def _thorough(self) -> bool:
         """Whether all attempts are asked for, to find better optima than those that come easily."""
-        assert self.settings.enough is not None
-        return self.settings.enough > 1.0
+        assert self.settings.done_share is not None
+        return self.settings.done_share > 1.0
 
     def _unfinished(self, chains: Chains) -> np.ndarray:
         """Which chains the finish polishes, (rows,): those that move and have iterations left.
@@ -414,15 +414,15 @@ class Search:
         left = moves & (done < most)
         if left.sum() > STRAGGLERS * self.chains:
             return left
-        costs, size = chains.worth - self.stage.floor[0], np.asarray(chains.info.size)
+        costs, size = chains.sound_cost - self.stage.floor[0], np.asarray(chains.info.size)
         bar = done_up_to(costs, size, CHEAPER, self.stage.cost_scale[0])
         near = costs <= bar if chains.sound.any() else moves
         return moves & near & (done < polish.patience * most) & (moves | ~near).all()
 
-    def _worth(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
+    def _sound_costs(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
         """Costs of those problems' chains, from their floors, (len(indices), chains)."""
-        worth = chains.worth.reshape(self.family.count, self.chains)[indices]
-        return worth - self.stage.floor[indices, None]
+        costs = chains.sound_cost.reshape(self.family.count, self.chains)[indices]
+        return costs - self.stage.floor[indices, None]
 
     def _done_up_to(self, indices: np.ndarray, now: Chains | None = None) -> np.ndarray:
         """Up to which cost, from their floors, chains of those problems are done, (n, 1).
@@ -432,10 +432,10 @@ class Search:
         stage, kept, n = self.stage, self.stage.kept, len(indices)
         costs, sizes = [], []
         if kept is not None:
-            costs.append(self._worth(kept, indices))
+            costs.append(self._sound_costs(kept, indices))
             sizes.append(np.asarray(kept.info.size).reshape(-1, self.chains)[indices])
         if now is not None:
-            costs.append(now.worth.reshape(n, self.chains) - stage.floor[indices, None])
+            costs.append(now.sound_cost.reshape(n, self.chains) - stage.floor[indices, None])
             sizes.append(np.asarray(now.info.size).reshape(n, self.chains))
         assert self.settings.within is not None
         both = np.concatenate(costs, axis=1), np.concatenate(sizes, axis=1)
@@ -548,9 +548,9 @@ class Search:
                 feasible = np.asarray(info.max_defect) < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 asked = stage.step % self._usual_report(total) == 0
-                worth = now.worth if asked else stage.before
+                costs = now.sound_cost if asked else stage.before
                 now = Chains.of(state, info, np.where(feasible, since, -1))
-                self._report(replace(stage, now=now, before=worth, step=stop), before + stop)
+                self._report(replace(stage, now=now, before=costs, step=stop), before + stop)
                 if self._too_hot:
                     self.stage = replace(self.stage, coolings=self.stage.coolings + 1)
                     self._begin_chunk()
@@ -581,7 +581,7 @@ class Search:
             require_alive(self.flow, self.family.at(0), replace(knots, slack=None), died_at)
 
     def _waits(self, now: Chains) -> bool:
-        """Whether to go on with an attempt; see `Standing`.
+        """Whether to go on with an attempt; see `AttemptSoFar`.
 
         Where a finish will follow, what is left of an attempt is polished there. Else all that
         matters is waited for, but for a share `STRAGGLERS`. It depends on the chains alone, and is
@@ -600,22 +600,22 @@ class Search:
             bar, floor = self._done_up_to(self.indices, now).item(), stage.floor[0]
             kept = np.zeros(self.chains, bool)
             if stage.kept is not None:
-                kept = stage.kept.worth - floor <= bar
-            assert settings.enough is not None
-            standing = Standing(
+                kept = stage.kept.sound_cost - floor <= bar
+            assert settings.done_share is not None
+            so_far = AttemptSoFar(
                 owners=stage.owners,
                 active=active,
-                worth=now.worth - floor,
+                cost=now.sound_cost - floor,
                 before=stage.before - floor,
                 bar=bar,
                 kept=kept,
-                needless=(1.0 - settings.enough) * self.chains,
+                needless=(1.0 - settings.done_share) * self.chains,
                 iterations=stage.step,
                 since=usual,
             )
-            if self._ends_early and standing.over:
+            if self._ends_early and so_far.over:
                 return False
-            active = standing.waited_for
+            active = so_far.waited_for
         return bool(active.sum() > STRAGGLERS * len(active))
 
     def _usual_report(self, total: int) -> int:
@@ -652,7 +652,7 @@ class Search:
         now = self._whole(stage.now)
         better = np.zeros(len(stage.owners), bool)
         if self.guess is not None and stage.attempt == stage.rollouts == 0:
-            # The attempt may have lost a guess that touches where it should: it goes on from it
+            # The attempt may have lost contacts of the guess: rollouts then start from the guess
             guessed = self._replayer.rolled_out(self._guessed(), 0.0, stage.done)
             now, better = self._no_worse(now, guessed)
         if (

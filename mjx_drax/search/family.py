@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -58,6 +59,11 @@ class Family:
     problem: Problem
     differs: tuple[bool, ...]
     count: int
+
+    @cached_property
+    def kinked(self) -> bool:
+        """Whether f has kinks, asked once: a model of MuJoCo takes milliseconds to say."""
+        return self.problem.dynamics.kinked
 
     @property
     def alone(self) -> bool:
@@ -120,7 +126,7 @@ class Family:
         def differing(value: Any) -> list[Array]:
             try:
                 found, structure = jax.tree.flatten(make(value))
-            except Exception as error:  # numbers were no trouble, above
+            except Exception as error:  # with plain numbers it has worked, above
                 ours = isinstance(error, DraxError)
                 words = "what it builds takes numbers, not traced values" if ours else plain(error)
                 raise DraxError(
@@ -276,7 +282,7 @@ class Family:
 
         way = largest(plan, np.broadcast_to(plan[:, :1], plan.shape))
         best = Tracked(*map(np.array, run(np.arange(len(u)), gains)))
-        less = LESS_FEEDBACK if self.problem.dynamics.kinked and gains.any() else ()
+        less = LESS_FEEDBACK if self.kinked and gains.any() else ()
         for share in less:
             rows = np.flatnonzero(best.left)
             if not len(rows):

@@ -32,7 +32,7 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.scaled import without_units
 
 FEASIBLE = 1e-3
-"""Largest max|h| that counts as feasible: of defects in `Problem.unit`, and of constraints."""
+"""Largest max|h| of a feasible chain: of defects in `Problem.defect_scale`, and of constraints."""
 
 Tree = TypeVar("Tree")
 

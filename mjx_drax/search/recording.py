@@ -29,8 +29,9 @@ LIMIT = 500_000_000
 @jax.jit
 @full_precision
 def knot_defects(problem: Problem, trajectory: Trajectory) -> Array:
-    """max|h_k| of each knot, in the problem's `unit`, (chains, K), for a batch of chains."""
-    return jax.vmap(lambda z: jnp.abs(problem.defects(z) / problem.unit).max(axis=1))(trajectory)
+    """max|h_k| of each knot of a batch of chains, in `problem.defect_scale`, (chains, K)."""
+    scale = problem.defect_scale
+    return jax.vmap(lambda z: jnp.abs(problem.defects(z) / scale).max(axis=1))(trajectory)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class Replayer:
         """The best of chains and of their rollouts."""
         ran, missed = self.replayed(chains, with_feedback)
         found = self._as_knots(chains, ran.states, ran.controls, missed, done)
-        if with_feedback:  # a plan is fine that is reached in one of two ways
+        if with_feedback:  # one replay that arrives, with feedback or without, is enough
             missed = missed & chains.missed
         return best_of(replace(chains, missed=missed), found, np.arange(len(missed)))
 
@@ -98,7 +98,7 @@ class Replayer:
         rest = np.flatnonzero(better == 0.0)
         if not len(rest):
             return found, better
-        # Shares are replayed side by side: a replay takes its time by its knots, not by its rows
+        # Shares are replayed side by side: a replay hardly takes longer with more rows
         ends, count = (now.state.trajectory, whole.state.trajectory), len(SHARES)
         parts = [between(self.question[1], self.question[0], *ends, share) for share in SHARES]
         plan = np.concatenate([self._plans(part)[rest] for part in parts])
@@ -130,12 +130,12 @@ class Replayer:
         """
         family, defect = self.family, np.array(info.max_defect)
         which = np.flatnonzero(won & ~(defect < FEASIBLE))
-        if not (family.problem.dynamics.kinked and len(which)):
+        if not (family.kinked and len(which)):
             return info
         broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
-        plan, of = self._plans(knots), self.of
-        for row in which.tolist():
-            problem = family.at(int(of[row]))
-            off = problem.engine_defects(plan[row], np.asarray(knots.u[row]))
-            defect[row] = max((off / np.asarray(problem.unit)).max(), broken[row])
+        plan, u = self._plans(knots), np.asarray(knots.u)
+        for index in np.unique(self.of[which]):
+            problem, rows = family.at(int(index)), which[self.of[which] == index]
+            off = problem.engine_defects(plan[rows], u[rows]) / np.asarray(problem.defect_scale)
+            defect[rows] = np.maximum(off.max(axis=(1, 2)), broken[rows])
         return replace(info, max_defect=jnp.asarray(defect))

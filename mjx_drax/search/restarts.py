@@ -44,7 +44,7 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.checks import check_flow
 
-ENOUGH, ENOUGH_KINKED = 0.95, 0.9
+DONE_SHARE, DONE_SHARE_KINKED = 0.95, 0.9
 """Default share of chains to be done; attempts are long where f has kinks."""
 
 WITHIN, WITHIN_KINKED = 0.1, 1.0
@@ -90,7 +90,7 @@ class Restarts:
         attempts: largest number of attempts, the first included.
         within: a chain is done if it is feasible, reaches the goal where it was replayed, and
             exceeds the best chain's cost by at most this share. None: 0.1; 1 where f has kinks.
-        enough: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
+        done_share: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
             where f has kinks. Above 1 all attempts are made, by all chains, to their ends and (if
             `heated`) with noise: that takes longer, and finds better optima where all chains of the
             first attempt lead to the same ones.
@@ -118,7 +118,7 @@ class Restarts:
     descent: int | None = 100
     attempts: int = 5
     within: float | None = None
-    enough: float | None = None
+    done_share: float | None = None
     heated: bool | None = None
     rollouts: Rollouts | None = None
     polish: Polish | None = None
@@ -153,7 +153,7 @@ class Restarts:
         rolled_out = kinked and replace(self, polish=polish).after >= Rollouts.iterations
         values: dict[str, Any] = {
             "within": WITHIN_KINKED if kinked else WITHIN,
-            "enough": ENOUGH_KINKED if kinked else ENOUGH,
+            "done_share": DONE_SHARE_KINKED if kinked else DONE_SHARE,
             "heated": None if kinked else True,
             "rollouts": Rollouts() if rolled_out else Rollouts(first=0, rounds=0),
             "polish": polish,
@@ -188,8 +188,8 @@ class Restarts:
         require_whole("attempts", self.attempts)
         if self.within is not None:
             require_not_negative("within", self.within)
-        if self.enough is not None:
-            require_not_negative("enough", self.enough)
+        if self.done_share is not None:
+            require_not_negative("done_share", self.done_share)
         if not isinstance(self.heated, bool | None):
             raise DraxError(f"heated is {shown(self.heated)}: give True, False or None.")
         if not isinstance(self.polish, Polish | None):

@@ -91,6 +91,7 @@ def without_units(flow: Langevin, problem: Problem) -> Langevin:
     if not metric.scaled_by_box:
         return flow
     of_x, of_u = problem.widths
-    x = jnp.where((jnp.asarray(flow.scale.noise) > 0.0) & (of_x > 0.0), of_x / HEATED, problem.unit)
+    heated = (jnp.asarray(flow.scale.noise) > 0.0) & (of_x > 0.0)
+    x = jnp.where(heated, of_x / HEATED, problem.defect_scale)
     u = jnp.where(of_u > 0.0, of_u / CONTROLS, 1.0)
     return replace(flow, preconditioner=Scaled(metric, x, u))

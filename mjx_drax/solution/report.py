@@ -141,7 +141,8 @@ def _apart(solution: Results, first: Optimum, other: Optimum) -> str:
     A range is at least what a feasible plan may be off: a ball that flies straight has one of
     rounding's size to its side.
     """
-    dynamics, least = solution.problem.dynamics, FEASIBLE * np.asarray(solution.problem.unit)
+    problem, dynamics = solution.problem, solution.problem.dynamics
+    least = FEASIBLE * np.asarray(problem.defect_scale)
     here, there = (np.asarray(optimum.trajectory.x) for optimum in (first, other))
     off = dynamics.host_difference(there, here)
     both = dynamics.host_difference(np.concatenate([here, there]), here[:1])

@@ -51,10 +51,10 @@ _FIRST, _LAST = 0.6, 0.8  # [s] the scattered knots, and the last iteration, sta
 _EVEN = 0.25  # share of the film's time that is spread evenly over the iterations
 _SMALLEST = 1e-9  # smaller max|h| is drawn as this, on a logarithmic axis
 _TEXT, _PAPER, _LINE, _FRAME = "#e8ebf0", "#0e1219", "#56B4E9", "#5a6270"
-_PARTS, _COUNT = 300, (6, 24)  # geoms of all ghosts, and range of their number, by default
+_PARTS, _COUNT = 300, (6, 24)  # geoms of all poses, and range of their number, by default
 _STRIP = 0.24  # share of the height that the curves take
-_GHOST, _FAINT = 0.62, 0.13  # opacity of ghosts before the motion is played, and while it is
-_FEWER = 3  # while it is played, every third ghost is left
+_CLEAR, _FAINT = 0.62, 0.13  # opacity of poses before the motion is played, and while it is
+_FEWER = 3  # while it is played, every third pose is left
 _OTHER = 0.45  # opacity of other chains' paths
 
 
@@ -63,7 +63,7 @@ def render_diffusion(
     path: str | os.PathLike[str],
     *,
     seconds: float | None = None,
-    ghosts: int | None = None,
+    poses: int | None = None,
     chains: int = 6,
     fps: float = 30.0,
     size: tuple[int, int] = (800, 600),
@@ -76,14 +76,14 @@ def render_diffusion(
 
     Where attempts failed before, the best one for that chain of each is shown, one after the other.
     Where a body moves in the plane or in space, and for problems without a model, paths of other
-    chains are shown too. Ghosts are translucent copies of the robot.
+    chains are shown too. Poses are translucent copies of the robot.
 
     Args:
       solution: from `solve(..., record=1)`.
       path: where to, ending in .mp4, .gif or .webp; its folder is made if need be.
       seconds: that the diffusion takes in the film [s]; by default 7, and 2 for each further
         attempt.
-      ghosts: number of knots at which the robot is shown; by default 24, or fewer if it has many
+      poses: number of knots at which the robot is shown; by default 24, or fewer if it has many
         parts, which take long to draw without a GPU.
       chains: number of chains whose paths are shown, those of distinct optima first.
       fps, size, speed, caption: as in `render`.
@@ -103,8 +103,8 @@ def render_diffusion(
     check(problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
     if seconds is not None:
         require_positive("seconds", seconds)
-    if ghosts is not None:
-        require_whole("ghosts", ghosts)
+    if poses is not None:
+        require_whole("poses", poses)
     require_whole("chains", chains)
     video_path(path)
     shown = [recording.path(chain) for chain in _chains(solution, chains)]
@@ -133,7 +133,7 @@ def render_diffusion(
 
     def frames() -> Generator[Frame, None, None]:
         if model is not None:
-            pictures = _robot_pictures(film, model, ghosts, FREE if camera is None else camera)
+            pictures = _robot_pictures(film, model, poses, FREE if camera is None else camera)
         else:
             assert draw is not None  # as checked
             pictures = _task_pictures(film, draw, np.asarray(problem.x_init, float))
@@ -276,12 +276,12 @@ class Film:
 
 
 def _robot_pictures(
-    film: Film, model: mujoco.MjModel, ghosts: int | None, camera: str | int
+    film: Film, model: mujoco.MjModel, poses: int | None, camera: str | int
 ) -> Iterator[Frame]:
     """The robot at some knots, and the paths of a body that travels."""
     best, nq, qpos = film.shown[0], model.nq, film.states[:, : model.nq]
     parts = int(np.count_nonzero(model.body_weldid[model.geom_bodyid] != 0))
-    count = int(np.clip(_PARTS // max(parts, 1), *_COUNT)) if ghosts is None else ghosts
+    count = int(np.clip(_PARTS // max(parts, 1), *_COUNT)) if poses is None else poses
     horizon, body = best.x.shape[1], travelling_body(model)
     knots = np.linspace(0, horizon - 1, min(count, horizon)).round().astype(int)
     points: list[Floats] = []
@@ -304,7 +304,7 @@ def _robot_pictures(
     with open_renderer(model, height, width) as renderer:
         for at in film.moments:
             scene.begin(None)
-            add(at, knots, _GHOST)
+            add(at, knots, _CLEAR)
             yield renderer.render(scene.content)
         for time in film.frame_times:
             scene.begin(interpolated(model, qpos, film.times, time))

@@ -32,9 +32,9 @@ def render_timelapse(
     plan: bool = False,
     draw: Draw | None = None,
 ) -> Path:
-    """One picture of a chain's motion as it was replayed: ghosts, and the last pose.
+    """One picture of a chain's motion as it was replayed: earlier poses, and the last one.
 
-    Ghosts are translucent copies of the robot, equally far apart in time, the fainter the earlier.
+    Earlier poses are translucent, equally far apart in time, the fainter the earlier.
 
     Args:
       solution: from `solve`.

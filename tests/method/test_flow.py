@@ -100,7 +100,7 @@ def test_the_program_is_the_one_that_the_solver_sees():
     np.testing.assert_allclose(
         info.cost, [0.5 * point @ H @ point + g @ point + at_x0 + WT**2 * TARGET @ TARGET / 2]
     )
-    h = np.abs(J @ point + h0).reshape(K, NX) / problem.unit
+    h = np.abs(J @ point + h0).reshape(K, NX) / problem.defect_scale
     np.testing.assert_allclose(info.max_defect, [h.max()])
 
 

@@ -176,6 +176,20 @@ def test_a_parameter_is_chosen_once():
     assert names == ["x0", "x1", "speed_0", "speed_1", "unused"]
 
 
+def test_the_c_engine_has_no_defects_of_its_own_motion_in_any_phase():
+    problem = robot(horizon=[(0.03, 0.1), (0.05, 0.2)], knots=[5, 7], dt=None)
+    steps = np.array([[0.01, 0.02], [0.008, 0.012]])
+    plan = np.tile(np.asarray(problem.x_init, float), (2, 13, 1))
+    plan[:, :, 2:] = steps[:, None]
+    u = 0.3 * np.ones((2, 12, 1))
+    states, _ = problem.replay(plan, u, np.zeros((2, 12, 1, 4)))
+    assert np.abs(states[:, -1, 0] - states[:, 0, 0]).min() > 1e-3
+    off = problem.engine_defects(states, u)
+    assert off.shape == (2, 12, 4)
+    np.testing.assert_allclose(off, 0.0, atol=1e-9)
+    np.testing.assert_array_equal(problem.engine_defects(states[1], u[1]), off[1])
+
+
 @pytest.mark.slow
 def test_the_c_engine_replays_the_changed_model_at_its_own_step():
     problem = robot(

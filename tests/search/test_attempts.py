@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjx_drax.search.attempts import (
-    Standing,
+    AttemptSoFar,
     done_up_to,
     noise_is_better,
     owners_of_places,
@@ -16,15 +16,15 @@ from mjx_drax.search.attempts import (
 INF = np.inf
 
 
-def standing(worth, active, before=None, kept=None, owners=None, **rest):
-    worth = np.asarray(worth, float)
-    count = len(worth)
+def so_far(cost, active, before=None, kept=None, owners=None, **rest):
+    cost = np.asarray(cost, float)
+    count = len(cost)
     given = {"bar": 1.0, "needless": 0.0, "iterations": 100, "since": 20} | rest
-    return Standing(
+    return AttemptSoFar(
         owners=np.arange(count) if owners is None else np.asarray(owners),
         active=np.asarray(active, bool),
-        worth=worth,
-        before=worth if before is None else np.asarray(before, float),
+        cost=cost,
+        before=cost if before is None else np.asarray(before, float),
         kept=np.zeros(count, bool) if kept is None else np.asarray(kept, bool),
         **given,
     )
@@ -51,39 +51,39 @@ def test_chains_are_done_up_to_a_share_above_the_best_or_of_its_size():
 
 def test_all_active_places_are_waited_for_unless_another_attempt_will_be_made():
     # the third is far too expensive, the fourth is not sound yet
-    worth, active = [0.9, 0.95, 7.0, INF], [False, True, True, True]
-    must = standing(worth, active)
+    cost, active = [0.9, 0.95, 7.0, INF], [False, True, True, True]
+    must = so_far(cost, active)
     np.testing.assert_array_equal(must.waited_for, [False, True, False, True])
-    may = standing(worth, active, needless=1.0)
+    may = so_far(cost, active, needless=1.0)
     np.testing.assert_array_equal(may.waited_for, active)
 
 
 def test_an_attempt_is_over_once_enough_chains_have_settled():
-    assert not standing([0.9, 0.9], [False, True]).over  # no other attempt would follow
-    assert not standing([0.9, 0.9], [False, True], needless=1.0).over  # nor a finish do more
-    assert standing([0.9, 0.9], [False, True], owners=[0, 0], kept=[False, True]).over
-    assert not standing([0.9, INF], [True, True], owners=[0, 0], kept=[False, True]).over
+    assert not so_far([0.9, 0.9], [False, True]).over  # no other attempt would follow
+    assert not so_far([0.9, 0.9], [False, True], needless=1.0).over  # nor a finish do more
+    assert so_far([0.9, 0.9], [False, True], owners=[0, 0], kept=[False, True]).over
+    assert not so_far([0.9, INF], [True, True], owners=[0, 0], kept=[False, True]).over
 
 
 def test_an_attempt_is_over_when_another_brings_chains_faster():
-    worth = np.array([0.9] * 40 + [7.0] * 60)
-    at = standing(worth, [True] * 100)
+    cost = np.array([0.9] * 40 + [7.0] * 60)
+    at = so_far(cost, [True] * 100)
     assert at.over  # none in 20 iterations, 40 in 100
-    before = np.where(np.arange(100) < 30, worth, INF)
+    before = np.where(np.arange(100) < 30, cost, INF)
     assert not replace(at, before=before).over  # ten in 20
     assert not replace(at, needless=58.0).over  # two are missing, which another cannot exceed
-    fewer = standing([0.9] * 2 + [7.0] * 98, [True] * 100, before=[0.9] * 5 + [7.0] * 95)
+    fewer = so_far([0.9] * 2 + [7.0] * 98, [True] * 100, before=[0.9] * 5 + [7.0] * 95)
     assert not fewer.over  # three are not feasible for the moment
     late = replace(at, iterations=1000)
     assert not late.over  # one more in 20 is not slower than 40 in 1,000
 
 
 def test_places_that_work_for_one_chain_count_once():
-    worth, owners = [0.9, 0.9, 0.9, 7.0], [2, 2, 2, 2]
-    at = standing(worth, [False] * 4, kept=[True, True, False, True], owners=owners)
+    cost, owners = [0.9, 0.9, 0.9, 7.0], [2, 2, 2, 2]
+    at = so_far(cost, [False] * 4, kept=[True, True, False, True], owners=owners)
     assert at.gained(at.near) == 1
     assert at.missing(at.near) == 0.0
-    assert standing(worth, [False] * 4, owners=owners).missing(at.near) == 3.0
+    assert so_far(cost, [False] * 4, owners=owners).missing(at.near) == 3.0
 
 
 def test_noise_goes_on_where_it_brought_as_many_chains_for_each_iteration():

@@ -32,7 +32,7 @@ from mjx_drax.search.restarts import Rollouts
 
 DT, CHAINS = 0.1, 4
 SOLVER = Restarts(
-    replace(Restarts().flow, iterations=20, tail=20), descent=20, attempts=3, enough=2.0
+    replace(Restarts().flow, iterations=20, tail=20), descent=20, attempts=3, done_share=2.0
 )
 STARTS = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 2)).astype(np.float32)
 

@@ -77,7 +77,7 @@ def swing(weight=1.0):
 @pytest.mark.slow
 @pytest.mark.parametrize(("start", "coolings"), [(6.0, 0), (1e3, 2), (1e4, 3)])
 def test_an_attempt_that_noise_throws_away_starts_again_with_less(start, coolings):
-    solver = Restarts(attempts=2, enough=1.1)  # always with noise
+    solver = Restarts(attempts=2, done_share=1.1)  # always with noise
     solver = replace(solver, flow=replace(solver.flow, noise=Geometric(start, 1.5e-3)))
     found = solve(point(running_residual=lambda x, u: 0.1 * u), chains=4, solver=solver)
     began = found.history["began"]
@@ -90,7 +90,7 @@ def test_an_attempt_that_noise_throws_away_starts_again_with_less(start, cooling
 def test_chains_in_the_worse_minimum_are_heated_until_they_leave_it():
     once = minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=1))
     assert 0 < np.mean(once.cost > 2 * once.cost.min()) < 1  # some are trapped
-    many = minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=8, enough=1.0))
+    many = minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=8, done_share=1.0))
     assert (many.cost < 2 * many.cost.min()).all()
     assert many.cost.min() == pytest.approx(once.cost.min(), rel=1e-3)
 
@@ -98,7 +98,7 @@ def test_chains_in_the_worse_minimum_are_heated_until_they_leave_it():
 @pytest.mark.slow
 def test_beyond_enough_every_chain_is_tried_again():
     first = search(Restarts(SHORT, attempts=1), chains=6)
-    further = search(Restarts(SHORT, attempts=3, enough=2.0), chains=6)
+    further = search(Restarts(SHORT, attempts=3, done_share=2.0), chains=6)
     assert (further.chains.cost <= first.chains.cost).all()
     moved = further.chains.cost < 0.99 * first.chains.cost
     assert moved.any()
@@ -108,7 +108,7 @@ def test_beyond_enough_every_chain_is_tried_again():
 @pytest.mark.slow
 def test_what_an_attempt_leaves_early_is_polished_in_the_end():
     endless = Polish(tolerance=1e-12, iterations=60, patience=1)
-    found = search(Restarts(SHORT, attempts=2, enough=1.0, polish=endless), chains=64)
+    found = search(Restarts(SHORT, attempts=2, done_share=1.0, polish=endless), chains=64)
     _, (_, noise_ends), (finish, no_noise) = found.began
     assert finish < noise_ends + endless.iterations  # the second attempt was left early
     assert no_noise == finish
@@ -142,7 +142,7 @@ def test_a_solve_ends_after_the_seconds_that_it_is_given():
 def test_attempts_go_on_without_noise_where_it_brought_less_unless_all_are_asked_for():
     flow = replace(SHORT, iterations=200, noise=Constant(1e-6))  # it only takes longer
     for enough, noisy in ((1.0, 0), (2.0, 200)):
-        found = search(Restarts(flow, descent=5, attempts=4, enough=enough), chains=64)
+        found = search(Restarts(flow, descent=5, attempts=4, done_share=enough), chains=64)
         first, second, third, *_ = [ends - began for began, ends in found.began]
         assert (first, second, third) == (0, 200, noisy)
 
@@ -170,7 +170,7 @@ def test_no_setting_depends_on_the_units_of_the_cost(weight):
 @pytest.mark.slow
 def test_attempts_share_one_compilation():
     before = iterate._cache_size()
-    found = search(Restarts(SHORT, attempts=3, enough=2.0))
+    found = search(Restarts(SHORT, attempts=3, done_share=2.0))
     assert [ends - began for began, ends in found.began] == [0, 40, 40]  # the first has no noise
     assert iterate._cache_size() - before == 1
 
@@ -255,14 +255,17 @@ def test_a_langevin_is_one_attempt_as_it_stands():
         ({"attempts": 0}, "attempts is 0: give a whole number of at least 1"),
         ({"descent": -1}, "descent is -1"),
         ({"within": "half"}, "within is 'half'"),
-        ({"enough": -0.5}, "enough is -0.5"),
+        ({"done_share": -0.5}, "done_share is -0.5"),
         ({"flow": "fast"}, "flow is 'fast': give a Langevin"),
         ({"flow": Langevin(tail=-1)}, "tail is -1"),
         ({"heated": "yes"}, "heated is 'yes': give True, False or None"),
         ({"rollouts": 3}, r"rollouts is 3: give Rollouts\(\) or None"),
         ({"rollouts": Rollouts(rounds=-1)}, "rollouts.rounds is -1"),
         ({"rollouts": Rollouts(iterations=0)}, "rollouts.iterations is 0"),
-        ({"rollouts": Rollouts(iterations=30), "polish": Polish(iterations=20)}, "than the 20 that"),
+        (
+            {"rollouts": Rollouts(iterations=30), "polish": Polish(iterations=20)},
+            "than the 20 that",
+        ),
         ({"polish": 1e-6}, r"polish is 1e-06: give Polish\(\) or None"),
         ({"polish": Polish(0.0)}, "polish.tolerance is 0.0"),
         ({"polish": Polish(iterations=-1)}, "polish.iterations is -1"),
@@ -461,8 +464,8 @@ TINY = replace(Restarts().flow, iterations=4, tail=4)
 @pytest.mark.slow
 def test_settings_that_depend_on_the_problem(balls):
     smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
-    assert (smooth.within, smooth.enough, smooth.heated) == (0.1, 0.95, True)
-    assert (kinked.within, kinked.enough, kinked.heated) == (1.0, 0.9, None)
+    assert (smooth.within, smooth.done_share, smooth.heated) == (0.1, 0.95, True)
+    assert (kinked.within, kinked.done_share, kinked.heated) == (1.0, 0.9, None)
     assert (smooth.rollouts, kinked.rollouts) == (NO_ROLLOUTS, Rollouts())
     assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(1e-4))
     sampled = replace(TINY, preconditioner=GaussNewton(derivatives=Smoothed()))
@@ -473,7 +476,7 @@ def test_settings_that_depend_on_the_problem(balls):
     solver = Restarts(TINY, descent=4, attempts=2)
     found = solve(balls[1], chains=2, solver=solver).solver
     rest = {"rollouts": Rollouts(), "polish": Polish(1e-4)}
-    assert found == replace(solver, within=1.0, enough=0.9, **rest)
+    assert found == replace(solver, within=1.0, done_share=0.9, **rest)
 
 
 @pytest.mark.slow
@@ -491,7 +494,7 @@ def test_where_f_has_kinks_noise_is_tried_in_turns_while_no_chain_is_done(balls)
 def test_no_setting_of_the_users_is_replaced(balls):
     given = {
         "within": 0.5,
-        "enough": 2.0,
+        "done_share": 2.0,
         "heated": True,
         "rollouts": Rollouts(first=1, rounds=3, iterations=1),
         "polish": Polish(iterations=0),
@@ -506,7 +509,7 @@ def test_no_setting_of_the_users_is_replaced(balls):
         np.testing.assert_array_equal(
             found.history["iteration"], [0, 9, 10, 11, 12, 20, 21, 22, 23]
         )
-    none = replace(solver, enough=0.0, heated=False, rollouts=NO_ROLLOUTS)
+    none = replace(solver, done_share=0.0, heated=False, rollouts=NO_ROLLOUTS)
     found = solve(balls[1], chains=2, solver=none)
     assert found.solver == none
     np.testing.assert_array_equal(found.history["iteration"], [0, 9])

@@ -160,7 +160,7 @@ def test_ctrl_c_in_a_later_attempt_keeps_the_answers_of_the_first():
     def solved(solver, progress=None):
         return solve_batch(from_start, STARTS, 3, solver=solver, chunk=2, progress=progress)
 
-    solver = replace(SOLVER, enough=2.0)
+    solver = replace(SOLVER, done_share=2.0)
     first, kept = solved(replace(solver, attempts=1)), solved(solver, interrupt)
     assert kept.certified.all()
     assert (kept.chain_cost[:2] <= first.chain_cost[:2]).all()

@@ -110,7 +110,7 @@ def test_it_is_saved_and_loaded_in_float64(problem, solution, tmp_path):
 
 def test_a_guess_and_another_attempt_stay_in_float64(problem):
     guess = Trajectory(np.zeros((10, 2)), np.zeros((10, 1)))
-    eager = Restarts(descent=20, attempts=2, enough=2.0)
+    eager = Restarts(descent=20, attempts=2, done_share=2.0)
     found = solve(problem, chains=2, solver=eager, guess=guess, record=10, precision=64)
     assert len(found.history["began"]) == 2
     assert found.residual.max() < 1e-8

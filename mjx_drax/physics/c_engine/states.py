@@ -65,12 +65,18 @@ def moved(model: mujoco.MjModel, qpos: Floats, dq: Floats, by: float = 1.0) -> F
     return out
 
 
+def differences(model: mujoco.MjModel, x: Floats, y: Floats) -> Floats:
+    """x - y in the tangent space at y, (n, ndx), for states (n, nx)."""
+    nq, nv = model.nq, model.nv
+    off = np.concatenate([np.empty((len(x), nv)), x[:, nq:] - y[:, nq:]], axis=1)
+    for row, one, other in zip(off, y, x, strict=True):
+        mujoco.mj_differentiatePos(model, row[:nv], 1.0, one[:nq], other[:nq])
+    return off
+
+
 def difference(model: mujoco.MjModel, x: Floats, y: Floats) -> Floats:
-    """x - y in the tangent space at y, (ndx,), for states (nx,)."""
-    if model.nq == model.nv:
-        return x - y
-    nq = model.nq
-    return np.concatenate([between(model, y[:nq], x[:nq]), x[nq:] - y[nq:]])
+    """The same for one state (nx,), (ndx,)."""
+    return differences(model, x[None], y[None])[0]
 
 
 def integrate(model: mujoco.MjModel, x: Floats, dx: Floats) -> Floats:

@@ -28,10 +28,10 @@ AT_ONCE = 1 << 16
 EDGES, ROUNDS = 48, 2
 """Edges of each polytope that are compared; and how often, each time about the best direction."""
 
-ASIDE, SAME = 0.95, 1e-6
+DIFFERENT, SAME = 0.95, 1e-6
 """Cosine of the angle of two normals that are clearly different, and depths that are not [m]."""
 
-SHORT = 1e-3
+PARALLEL = 1e-3
 """Sine of the angle below which two edges count as parallel."""
 
 APART = 1.0
@@ -80,7 +80,7 @@ def contacts(
     none = jnp.zeros((), jnp.int32)
     _, p, q, gap = lax.fori_loop(0, ROUNDS, round_, (direction, none, none, gaps[0]))
     across, least = _normal(one, other, p, q), jnp.max(lax.stop_gradient(dist))
-    beside = lax.stop_gradient(across @ axis) < ASIDE
+    beside = lax.stop_gradient(across @ axis) < DIFFERENT
     nearer = gap > jnp.max(gaps) + SAME
     if not boxes:
         nearer &= beside
@@ -167,7 +167,7 @@ def _normal(a: ConvexMesh, b: ConvexMesh, p: Array, q: Array) -> Array:
 def _unit(v: Array) -> Array:
     """v (..., 3) scaled to length 1; 0 where it is short."""
     squared = jnp.sum(v**2, axis=-1, keepdims=True)
-    sound = squared > SHORT**2
+    sound = squared > PARALLEL**2
     return jnp.where(sound, v * lax.rsqrt(jnp.where(sound, squared, 1.0)), 0.0)
 
 

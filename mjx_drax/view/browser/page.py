@@ -6,7 +6,7 @@ tree, in which these parts are shown and hidden:
     world    what does not move
     replay   the best chain, as its engine replayed it
     plan     the plan at the same time, in blue; hidden at first where the replay keeps to it
-    ghosts   some knots of the plan at once, translucent
+    poses    some knots of the plan at once, translucent
     path     of the geom that travels farthest, in the replay
     forces   at contacts, in the replay
 """
@@ -25,7 +25,7 @@ from mjx_drax.solution.solution import Solution
 from mjx_drax.view.browser.scene import ReplayScene, require_viewer, server_at
 from mjx_drax.view.video import outcome_lines
 
-GHOSTS = 8
+POSES = 8
 """So many knots of the plan are shown at once."""
 
 _BANNER = """\
@@ -37,7 +37,7 @@ _BANNER = """\
 </style>"""
 
 
-def save_html(solution: Solution, path: str | os.PathLike[str], ghosts: int = GHOSTS) -> Path:
+def save_html(solution: Solution, path: str | os.PathLike[str], poses: int = POSES) -> Path:
     """Write the best chain's replay as one HTML file that any browser opens; returns its path.
 
     A replay that turns non-finite is shown up to there.
@@ -45,23 +45,23 @@ def save_html(solution: Solution, path: str | os.PathLike[str], ghosts: int = GH
     Args:
         solution: from `solve`, of a problem from MJCF.
         path: where to, ending in .html.
-        ghosts: number of knots of the plan that are shown at once, as translucent robots.
+        poses: number of knots of the plan that are shown at once, as translucent robots.
 
     Raises:
-        DraxError: viser is not installed, the problem has no model, a number of ghosts below 0, or
+        DraxError: viser is not installed, the problem has no model, a number of poses below 0, or
             a path that cannot be written.
     """
     require_viewer(solution.problem)
-    require_whole("ghosts", ghosts, 0)
+    require_whole("poses", poses, 0)
     with complete(path, (".html", ".htm")) as partial:
-        partial.write_text(_page(solution, _recorded(solution, int(ghosts))), encoding="utf-8")
+        partial.write_text(_page(solution, _recorded(solution, int(poses))), encoding="utf-8")
     return file_path(path)
 
 
 def _page(solution: Solution, recording: str) -> str:
     """The recording with a title and a few lines about the solution."""
     *lines, _ = outcome_lines(solution)  # without the time
-    lines.append("plan, ghosts and path: see the scene tree, below at the right")
+    lines.append("plan, poses and path: see the scene tree, below at the right")
     head = _BANNER.format(
         name=html.escape(f"{solution.problem.name}, replayed"),
         background="#0e1219d0" if solution.certified else "#961414e0",
@@ -72,10 +72,10 @@ def _page(solution: Solution, recording: str) -> str:
     return f'{before}{head}</head>{start}<div id="drax">{text}</div></body>{end}'
 
 
-def _recorded(solution: Solution, ghosts: int) -> str:
+def _recorded(solution: Solution, poses: int) -> str:
     """The scene at all knots as viser's HTML."""
     with server_at() as server:
-        scene = ReplayScene(server, solution, ghosts)
+        scene = ReplayScene(server, solution, poses)
         recorder = server.get_scene_serializer()
         steps = np.diff(scene.times)
         for k, step in enumerate(steps, start=1):

@@ -1,4 +1,4 @@
-"""A solution in viser's scene: what does not move, robots, ghosts, a path and contact forces.
+"""A solution in viser's scene: what does not move, robots, poses, a path and contact forces.
 
 Bodies are frames that move from knot to knot, and their geoms are meshes in these frames. Tendons,
 skins and flexible bodies are left out; textures become their mean color.
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mjx_drax.problem.problem import Problem
     from mjx_drax.solution.solution import Solution
 
-_GHOST_OPACITY, _PLAN_OPACITY = 0.15, 0.5
+_POSE_OPACITY, _PLAN_OPACITY = 0.15, 0.5
 _PLAN_SCALE = 1.03  # a shell around the replay, where the two coincide
 _PATH_COLOR = (217, 84, 30)
 _GEOM, _OBJECT = mujoco.mjtGeom, mujoco.mjtObj
@@ -76,7 +76,7 @@ class ReplayScene:
         times: of the knots that can be shown [s], (T,).
     """
 
-    def __init__(self, server: viser.ViserServer, solution: Solution, ghosts: int) -> None:
+    def __init__(self, server: viser.ViserServer, solution: Solution, poses: int) -> None:
         model = mujoco_model(solution.problem.dynamics)
         assert model is not None  # as `require_viewer` checked
         states, controls = solution.replayed
@@ -93,13 +93,13 @@ class ReplayScene:
         add_world(scene, shapes, model)
         self.parts: dict[str, Any] = {
             name: scene.add_frame(f"/{name}", show_axes=False)
-            for name in ("replay", "plan", "ghosts")
+            for name in ("replay", "plan", "poses")
         }
         self.parts["plan"].visible = not follows["max_deviation"] < _ALIKE
         self._frames = add_robot(scene, "replay", shapes, replayed, None)
         self._frames += add_robot(scene, "plan", shapes, planned, _PLAN_COLOR)
-        knots = np.unique(np.linspace(0, len(planned[0]) - 1, ghosts).round().astype(int))
-        add_ghosts(scene, shapes, (planned[0][knots], planned[1][knots]), _GHOST_OPACITY)
+        knots = np.unique(np.linspace(0, len(planned[0]) - 1, poses).round().astype(int))
+        add_copies(scene, shapes, (planned[0][knots], planned[1][knots]), _POSE_OPACITY)
         self.parts["path"] = add_path(scene, shapes, replayed)
         width = 0.01 * float(model.stat.extent)
         if any(map(len, self._forces)):
@@ -306,32 +306,32 @@ def add_shape(
 
 
 @dataclass(frozen=True)
-class Ghost:
-    """One shape of all ghosts, and viser's handle of them."""
+class Copies:
+    """One shape of all copies of a robot, and viser's handle of them."""
 
     shape: Shape
     handle: Any
 
     def move(self, motion: Motion, colors: npt.NDArray[np.uint8]) -> None:
-        """Put the ghosts where the bodies are in a motion (n, ...), in colors (n, 3)."""
+        """Put the copies where the bodies are in a motion (n, ...), in colors (n, 3)."""
         positions, turns = placed(self.shape, motion)
         self.handle.batched_positions = positions.astype(np.float32)
         self.handle.batched_wxyzs = turns.astype(np.float32)
         self.handle.batched_colors = colors
 
 
-def add_ghosts(
+def add_copies(
     scene: viser.SceneApi, shapes: list[Shape], motion: Motion, opacity: float
-) -> list[Ghost]:
+) -> list[Copies]:
     """Robots at all knots of a motion at once: one batch for each geom."""
-    ghosts = []
+    copies = []
     for shape in shapes:
         if not shape.moves or shape.surface is None or not len(motion[0]):
             continue
         positions, turns = placed(shape, motion)
         vertices, faces = triangles(shape.surface)
         handle = scene.add_batched_meshes_simple(
-            f"/ghosts/{shape.label}",
+            f"/poses/{shape.label}",
             vertices,
             faces,
             turns,
@@ -341,8 +341,8 @@ def add_ghosts(
             flat_shading=not shape.smooth,
             cast_shadow=False,
         )
-        ghosts.append(Ghost(shape, handle))
-    return ghosts
+        copies.append(Copies(shape, handle))
+    return copies
 
 
 def add_path(scene: viser.SceneApi, shapes: list[Shape], motion: Motion) -> Any:

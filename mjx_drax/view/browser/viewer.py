@@ -1,6 +1,6 @@
 """A solution to look at while a program runs: in the browser, or in MuJoCo's own viewer.
 
-`show` serves a page with a bar of time; plan, replay, ghosts, path and contact forces are shown
+`show` serves a page with a bar of time; plan, replay, poses, path and contact forces are shown
 and hidden there. `Live` shows the knots of a solve while it runs. `show_natively` needs a display.
 """
 
@@ -21,11 +21,11 @@ from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.search.iterate import ranking
 from mjx_drax.search.recording import Recorder
-from mjx_drax.view.browser.page import GHOSTS
+from mjx_drax.view.browser.page import POSES
 from mjx_drax.view.browser.scene import (
-    Ghost,
+    Copies,
     ReplayScene,
-    add_ghosts,
+    add_copies,
     add_world,
     motion_of,
     require_viewer,
@@ -94,7 +94,7 @@ def _play(server: viser.ViserServer, solution: Solution, until: threading.Event)
     """Show the solution, and go on with time while the page says so."""
     server.scene.reset()
     server.gui.reset()
-    scene = ReplayScene(server, solution, GHOSTS)
+    scene = ReplayScene(server, solution, POSES)
     *lines, _ = outcome_lines(solution)  # without the time
     server.gui.add_markdown("  \n".join(lines))
     times, end = scene.times, float(scene.times[-1])
@@ -141,7 +141,7 @@ class Live(Recorder):
         self._shapes = shapes_of(model, start, server)
         add_world(server.scene, self._shapes, model)
         self._text = server.gui.add_markdown(f"{problem.name}: compiling ...")
-        self._ghosts: list[Ghost] = []
+        self._copies: list[Copies] = []
         self._chain = 0
 
     def take(self, problem: Problem, sigma: float, done: int, z: Trajectory, info: Info) -> None:
@@ -156,15 +156,15 @@ class Live(Recorder):
         states = shot.x[chain, knots].astype(float)
         if not np.isfinite(states).all():
             return
-        if not self._ghosts:
+        if not self._copies:
             self._colors = Colors.of(shot.defects[chain])
         colors = np.rint(255.0 * self._colors(shot.defects[chain, knots])[:, :3]).astype(np.uint8)
         motion = motion_of(self._model, states)
         with self._server.atomic():
-            if not self._ghosts:
-                self._ghosts = add_ghosts(self._server.scene, self._shapes, motion, _OPACITY)
-            for ghost in self._ghosts:
-                ghost.move(motion, colors)
+            if not self._copies:
+                self._copies = add_copies(self._server.scene, self._shapes, motion, _OPACITY)
+            for copies in self._copies:
+                copies.move(motion, colors)
             self._text.content = "  \n".join(
                 (
                     f"{self._name}: iteration {done}, noise {sigma:.2g}",
@@ -223,7 +223,7 @@ def show_natively(solution: Solution, until: threading.Event | None = None) -> N
     states = finite(states)
     plan = solution.plans[solution.best_chain][:, : model.nq].astype(float)
     times = solution.times_of(solution.best_chain)
-    size, data, ghost = model.nq + model.nv + model.na, mujoco.MjData(model), mujoco.MjData(model)
+    size, data, planned = model.nq + model.nv + model.na, mujoco.MjData(model), mujoco.MjData(model)
     keys: list[int] = []
     playing, now = True, 0.0
     with native.launch_passive(model, data, key_callback=keys.append) as window:
@@ -239,11 +239,11 @@ def show_natively(solution: Solution, until: threading.Event | None = None) -> N
                 set_state(model, data, states[knot, :size])
                 data.ctrl[:] = controls[min(knot, len(controls) - 1), : model.nu]
                 mujoco.mj_forward(model, data)
-                set_pose(model, ghost, interpolated(model, plan, times, now))
+                set_pose(model, planned, interpolated(model, plan, times, now))
                 window.user_scn.ngeom = 0
                 moving = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
                 option, pull = mujoco.MjvOption(), mujoco.MjvPerturb()
-                mujoco.mjv_addGeoms(model, ghost, option, pull, moving, window.user_scn)
+                mujoco.mjv_addGeoms(model, planned, option, pull, moving, window.user_scn)
                 for geom in window.user_scn.geoms[: window.user_scn.ngeom]:
                     geom.rgba[:] = _PLAN
             window.sync()

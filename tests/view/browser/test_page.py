@@ -19,7 +19,7 @@ from mjx_drax.view.exporters import Html
 @pytest.fixture(scope="module")
 def page(slider, tmp_path_factory):
     pytest.importorskip("viser")
-    return save_html(slider, tmp_path_factory.mktemp("page") / "replay.html", ghosts=5)
+    return save_html(slider, tmp_path_factory.mktemp("page") / "replay.html", poses=5)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_every_kind_of_geom_is_there(recording):
         assert sum(name.startswith(f"/{part}/1/") for name in meshes) == 7
     assert sum(name.startswith("/world/") for name in meshes) == 1  # the height field
     assert len(names(recording, "GridMessage")) == 1  # the floor
-    assert sum(n.startswith("/ghosts/") for n in names(recording, "BatchedMeshesMessage")) == 7
+    assert sum(n.startswith("/poses/") for n in names(recording, "BatchedMeshesMessage")) == 7
     assert "/path" in names(recording, "LineSegmentsMessage")
 
 
@@ -79,7 +79,7 @@ def test_a_replay_that_turns_nan_is_shown_up_to_there(slider, tmp_path):
     states = slider.open_loop.states.copy()
     states[:, 10:] = np.nan
     lost = replace(slider, open_loop=replace(slider.open_loop, states=states))
-    assert save_html(lost, tmp_path / "lost.html", ghosts=0).stat().st_size > 10_000
+    assert save_html(lost, tmp_path / "lost.html", poses=0).stat().st_size > 10_000
 
 
 def test_what_is_refused(slider, tmp_path, without, monkeypatch):
@@ -90,8 +90,8 @@ def test_what_is_refused(slider, tmp_path, without, monkeypatch):
         save_html(slider, tmp_path / "replay.html")
     monkeypatch.undo()
     pytest.importorskip("viser")
-    with pytest.raises(DraxError, match="ghosts is -1"):
-        save_html(slider, tmp_path / "replay.html", ghosts=-1)
+    with pytest.raises(DraxError, match="poses is -1"):
+        save_html(slider, tmp_path / "replay.html", poses=-1)
     with pytest.raises(DraxError, match=r"'replay.txt' does not end in .html"):
         save_html(slider, tmp_path / "replay.txt")
 
@@ -131,7 +131,7 @@ def test_a_browser_shows_it_and_scrubs(page):
         tab.click('[aria-label="Show scene tree"]')
         tab.wait_for_timeout(500)
         tree = "".join(tab.inner_text("body").split())
-        for part in ("world", "replay", "plan", "ghosts", "path"):
+        for part in ("world", "replay", "plan", "poses", "path"):
             assert f"/{part}" in tree
         browser.close()
     assert len({nothing, start, end}) == 3

@@ -84,7 +84,7 @@ def test_a_browser_shows_a_solve_and_then_its_answer():
         tab.goto(told[0].split()[1])
         tab.get_by_text("max|h|").wait_for(timeout=120_000)  # an iteration has been shown
         solved.wait(200)
-        for part in ("replay", "plan", "ghosts", "path"):
+        for part in ("replay", "plan", "poses", "path"):
             tab.get_by_text(part, exact=True).first.wait_for(timeout=60_000)
         tab.get_by_text("reaches the goal").or_(tab.get_by_text("misses the goal")).first.wait_for()
         tab.wait_for_timeout(2000)
