@@ -153,8 +153,7 @@ def test_an_enormous_force_elsewhere_changes_nothing():
     np.testing.assert_allclose(found[:, -1], 1e12)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [drawn, drawn_with_cones])
+@pytest.mark.parametrize("make", [pytest.param(drawn, marks=pytest.mark.slow), drawn_with_cones])
 def test_the_kernel_finds_the_same_accelerations(make):
     given = make()
     wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)

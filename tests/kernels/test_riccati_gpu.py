@@ -45,7 +45,7 @@ def agree(seen, wanted, tolerance):
             np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * scale, err_msg=name)
 
 
-@pytest.mark.parametrize("noisy", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("noisy", [True, False])
 def test_it_agrees_with_the_plain_recursion(noisy):
     with jax.enable_x64(True):
         arguments = batch(THREADS + 5, np.float64, noisy)  # two warps, one of them not full
@@ -53,10 +53,7 @@ def test_it_agrees_with_the_plain_recursion(noisy):
         agree(newton_steps(*jax.tree.leaves(arguments), interpret=True), plain, 1e-9)
 
 
-@pytest.mark.parametrize(
-    ("noisy", "penalty"),
-    [pytest.param(True, None, marks=pytest.mark.slow), (False, None), (False, np.inf)],
-)
+@pytest.mark.parametrize(("noisy", "penalty"), [(True, None), (False, None), (False, np.inf)])
 def test_blocks_agree_with_the_plain_recursion(noisy, penalty):
     with jax.enable_x64(True):
         arguments = batch(2, np.float64, noisy, ndx=17)  # a tile of 32
