@@ -73,12 +73,7 @@ class Plant:
         Raises:
             DraxError: a problem without a model, an unknown body, numbers that make no sense.
         """
-        model = mujoco_model(problem.dynamics)
-        if model is None:
-            raise DraxError(
-                f"{problem.name} has no model to simulate: use from_mjcf, or one of the tasks that "
-                '`mjx-drax list` calls "from MJCF".'
-            )
+        model = _model_of(problem)
         require_not_negative("noise", noise)
         require_not_negative("shaking", shaking)
         require_positive("mass", mass, "a positive factor, 1 for no error")
@@ -141,6 +136,21 @@ def _require_push(push: object) -> None:
         )
 
 
+def _model_of(problem: Problem) -> mujoco.MjModel:
+    """The problem's model.
+
+    Raises:
+        DraxError: it has none.
+    """
+    model = mujoco_model(problem.dynamics)
+    if model is None:
+        raise DraxError(
+            f"{problem.name} has no model to simulate: use from_mjcf, or one of the tasks that "
+            '`mjx-drax list` calls "from MJCF".'
+        )
+    return model
+
+
 def random_pushes(
     problem: Problem, count: int, size: float, over: tuple[float, float], seed: int
 ) -> list[Push]:
@@ -151,7 +161,7 @@ def random_pushes(
         size: momentum of each, as a velocity [m/s] of the body it acts on.
         over: between which times [s]; one falls into each of `count` equal parts.
     """
-    model = problem.dynamics.mj_model  # type: ignore[attr-defined]
+    model = _model_of(problem)
     random = np.random.default_rng(seed)
     movable = np.flatnonzero((model.body_weldid != 0) & (model.body_mass > 0.0))
     edges = np.linspace(*over, count + 1)

@@ -19,6 +19,7 @@ from mjx_drax.control.background import Background
 from mjx_drax.control.mpc import MPC, Statistics
 from mjx_drax.control.open_quantities import driven
 from mjx_drax.control.plant import Plant, Push, random_pushes
+from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 
@@ -223,10 +224,10 @@ def film(
     from mjx_drax.view.scene import posed
     from mjx_drax.view.video import render_motion
 
-    dynamics: Any = problem.dynamics
+    model = mujoco_model(problem.dynamics)
+    assert model is not None  # for the type checker: a plant has one
     lines_ = [f"{problem.name}, model predictive control", "t = {time}"]
     lines_ += [f"push of {p.force[0]:+.1f} N on {p.body} at {p.time:.2f} s" for p in motion.pushes]
-    model = dynamics.mj_model
     qpos = motion.states[:, : model.nq]
     strongest = max((np.linalg.norm(p.force) for p in motion.pushes), default=1.0)
     length = ARROW * float(model.stat.extent)

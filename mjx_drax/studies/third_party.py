@@ -8,7 +8,8 @@ table says which, and another one counts the reasons. With `--chains 0` nothing 
 says which models are usable, because their steps are those of the C engine. Models without
 actuators get motors. Models come from `pip install "mjx-drax[third-party]"`, from other packages of
 `FOLDERS`, or from any folder, such as a checkout of MuJoCo Menagerie; only their files are read,
-and nothing of the packages is imported. Every model gets a process of its own, with a time limit.
+and nothing of the packages is imported. Every model gets a process of its own, with a time limit;
+what needs JAX is imported there.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class Html(Exporter):
         require_viewer(problem)
 
     def write(self, solution: Solution, path: Path) -> None:
-        """Write the page; see `browser.save_html`."""
+        """Write the page; see `browser.page.save_html`."""
         from mjx_drax.view.browser.page import save_html
 
         save_html(solution, path)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import double_integrator, robot
 
 from mjx_drax import (
     MPC,
@@ -276,6 +277,17 @@ def test_random_pushes_are_spread_over_time(slider):
     pushes = random_pushes(slider, 3, 2.0, (1.0, 4.0), seed=5)
     assert [1 <= p.time - i <= 2 for i, p in enumerate(pushes)] == [True] * 3
     assert {abs(p.force[0]) for p in pushes} == {20.0}  # 2 m/s for 1 kg in 0.1 s
+
+
+def test_pushes_and_plant_have_the_model_of_a_problem_with_rates():
+    problem = robot(rates=1, running_cost=lambda data, u, knot: knot.rate @ knot.rate)
+    push = random_pushes(problem, 1, 2.0, (0.0, 1.0), seed=0)[0]
+    assert Plant(problem, pushes=[push]).model.body(push.body).mass > 0.0
+
+
+def test_pushes_need_a_model():
+    with pytest.raises(DraxError, match="no model to simulate"):
+        random_pushes(double_integrator(running_cost=lambda x, u: u @ u), 1, 2.0, (0.0, 1.0), 0)
 
 
 @pytest.mark.slow
