@@ -27,7 +27,7 @@ STARTS = np.array([[0.1, -0.1], [-0.2, 0.2], [0.0, 0.3]], np.float32)
 CHAINS = 8
 ONCE = Langevin(iterations=1, tail=40)
 """Hardly any noise: a chain stays in the valley where it began."""
-TWICE = Restarts(ONCE, descent=40, attempts=2, enough=1.0)
+TWICE = Restarts(ONCE, descent=40, attempts=2, done_share=1.0)
 """The second attempt works for the chains that did not end in the deepest valley."""
 
 

@@ -101,7 +101,7 @@ def test_film_of_a_model(
     if painted:
         monkeypatch.setattr(renderer, "gl_context", lambda: None)
     path = render_diffusion(
-        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(240, 180), ghosts=4
+        cartpole, tmp_path / "new" / "film.webp", seconds=0.5, fps=8, size=(240, 180), poses=4
     )
     with Image.open(path) as image:
         assert image.size == (240, 180)
@@ -113,7 +113,7 @@ def test_film_of_a_model(
     robots = shown[0][:130]
     difference = [np.abs(frame - shown[0]).mean() for frame in shown]
     assert difference[-1] > 2.0
-    assert (robots[..., 0] > robots[..., 2] + 90).sum() > 50  # ghosts that break the dynamics
+    assert (robots[..., 0] > robots[..., 2] + 90).sum() > 50  # poses that break the dynamics
     assert [item.name for item in path.parent.iterdir()] == ["film.webp"]
 
 
@@ -195,7 +195,7 @@ def test_what_cannot_be_filmed(trapped: Solution, cartpole: Solution, tmp_path: 
         render_diffusion(bare, target)
     with pytest.raises(DraxError, match="pass draw="):
         render_diffusion(trapped, target)
-    for name, value in {"seconds": 0, "ghosts": -1, "chains": 0, "fps": 0, "speed": -1}.items():
+    for name, value in {"seconds": 0, "poses": -1, "chains": 0, "fps": 0, "speed": -1}.items():
         with pytest.raises(DraxError, match=name):
             render_diffusion(cartpole, target, **{name: value})  # type: ignore[arg-type]
     with pytest.raises(DraxError, match="no camera 'side'"):
