@@ -79,11 +79,11 @@ def newton_steps(
         over_stages = jax.vmap(colored, in_axes=(None, 0, 0, 0, 0))
         of_u, of_x = jax.vmap(over_stages)(soft[:, 0], left["Q"], left["P"], xi_u, xi_e)
         white = [padded(of_u, M), padded(of_x, N)]
-        shapes |= {"nx": (N,), "nu": (M,)}
+        shapes |= {"noise_x": (N,), "noise_u": (M,)}
     step = launch(partial(forward, K), shapes, soft, A, B, h, multipliers, *factors, *white)
-    sizes = {"du": m, "nu": m}
+    sizes = {"du": m, "noise_u": m}
     found = {name: a[..., : sizes.get(name, n)] for name, a in step.items()}
-    return {"nx": None, "nu": None, **found, "K": left["K"][..., :m, :n]}
+    return {"noise_x": None, "noise_u": None, **found, "gains": left["K"][..., :m, :n]}
 
 
 def backward(horizon: int, n: int, m: int, product: Any, *refs: Any) -> None:

@@ -58,7 +58,7 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
     That is on GPUs, in one precision, for blocks of at most MAX_NDX and MAX_NU, and larger ones of
     float32 as far as `riccati_blocks` goes. The arrays of the
     step's arguments are, in their order, those of `newton_steps`; it returns
-    result(dx=, du=, nx=, nu=, rate=, K=).
+    result(dx=, du=, noise_x=, noise_u=, rate=, gains=).
     """
 
     def decorate(newton: Callable[..., Any]) -> Callable[..., Any]:
@@ -117,7 +117,8 @@ def newton_steps(
         interpret: run it without a GPU.
 
     Returns:
-        dx, nx, rate (chains, K, ndx), du, nu (chains, K, nu) and K (chains, K, nu, ndx); nx and nu
+        dx, rate and noise_x (chains, K, ndx), du and noise_u (chains, K, nu), gains
+            (chains, K, nu, ndx); noise_x and noise_u
         are None without noise.
     """
     chains, horizon, n, m = B.shape
@@ -127,7 +128,7 @@ def newton_steps(
     costs = Layout(gx=(n,), gu=(m,), Hxx=tri(n), Hux=(m, n), Huu=tri(m))
     left = Layout(K=(m, n), kff=(m,), Lu=tri(m), Ls=tri(n), P=tri(n), p=(n,))
     white = Layout(xi_u=(m,), xi_e=(n,))
-    noise = {"nx": (n,), "nu": (m,)} if noisy else {}
+    noise = {"noise_x": (n,), "noise_u": (m,)} if noisy else {}
     out = Layout(dx=(n,), du=(m,), **noise, rate=(n,))
 
     def launch(
@@ -153,7 +154,8 @@ def newton_steps(
     else:
         steps = launch(forward, (common, left), out, model, factors)
     step = {name: out.unpack(steps, name)[:chains] for name in out.shapes}
-    return {"nx": None, "nu": None, **step, "K": left.unpack(factors, "K")[:chains]}
+    gains = left.unpack(factors, "K")[:chains]
+    return {"noise_x": None, "noise_u": None, **step, "gains": gains}
 
 
 def backward(

@@ -5,12 +5,12 @@ H is the semidefinite model of the cost's Hessian plus the barrier's diagonal. O
 stage join its cost, their slack variables eliminated:
 
 At one knot let r = [equality; inequality + s] with Jacobian J = [E; G] in the knot's displacement
-dz, multipliers nu, and a barrier on s with slope b and curvature c (damping included). The model
+dz, multipliers y, and a barrier on s with slope b and curvature c (damping included). The model
 
-    nu'(r + J dz + [0; ds]) + mu/2 |r + J dz + [0; ds]|^2 + b'ds + 1/2 ds'diag(c) ds
+    y'(r + J dz + [0; ds]) + mu/2 |r + J dz + [0; ds]|^2 + b'ds + 1/2 ds'diag(c) ds
 
-is minimized over ds by ds = -(b + nu_g + mu r_g + mu G dz) / D with D = mu + c, elementwise. What
-is left for dz has gradient J'(nu + mu r) - G'(mu / D) t, where t = b + nu_g + mu r_g, and Hessian
+is minimized over ds by ds = -(b + y_g + mu r_g + mu G dz) / D with D = mu + c, elementwise. What
+is left for dz has gradient J'(y + mu r) - G'(mu / D) t, where t = b + y_g + mu r_g, and Hessian
 J'W J, W = mu for equalities and mu c / D for inequalities: an inequality matters more as
 its slack goes to zero. Given dz, ds has variance 1/D under N(0, M^{-1}).
 """
@@ -83,15 +83,15 @@ class GaussNewton(Metric):
         drift = Trajectory(step.dx, step.du, Stagewise(ds, ds_end) if slack else None, step.start)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
         if xi is None:
-            return Direction(drift, None, rates, step.K, memory)
-        assert step.nx is not None  # for the type checker
-        assert step.nu is not None
-        ns = jax.vmap(partial(slack_noise, penalty=penalties.stage))(
-            stages, stage_steps(step.nx, step.nu, None if first is None else first[:, 1]), xi.stage
-        )
-        ns_end = slack_noise(end, step.nx[-1], xi.terminal, penalties.terminal)
-        noise = Trajectory(step.nx, step.nu, Stagewise(ns, ns_end) if slack else None, step.nstart)
-        return Direction(drift, noise, rates, step.K, memory)
+            return Direction(drift, None, rates, step.gains, memory)
+        nx, nu, nx_0 = step.noise_x, step.noise_u, None if first is None else first[:, 1]
+        assert nx is not None  # for the type checker
+        assert nu is not None
+        of_stage = partial(slack_noise, penalty=penalties.stage)
+        ns = jax.vmap(of_stage)(stages, stage_steps(nx, nu, nx_0), xi.stage)
+        ns_end = slack_noise(end, nx[-1], xi.terminal, penalties.terminal)
+        noise = Trajectory(nx, nu, Stagewise(ns, ns_end) if slack else None, step.noise_start)
+        return Direction(drift, noise, rates, step.gains, memory)
 
 
 @register_dataclass
@@ -170,19 +170,19 @@ def with_constraints(
     K, ndx = derivatives.dynamics.h.shape
     none = Stagewise(jnp.zeros((K, 0)), jnp.zeros(0))
     slope, curvature = (of_barrier.slack or none for of_barrier in model.barrier)
-    r, nu = model.h.constraints, model.multipliers.constraints
+    r, y = model.h.constraints, model.multipliers.constraints
 
-    def reduce(penalty: Array, J: Array, r: Array, nu: Array, b: Array, c: Array) -> Any:
-        return eliminate(J, r, nu, b, c + damping, penalty)
+    def reduce(penalty: Array, J: Array, r: Array, y: Array, b: Array, c: Array) -> Any:
+        return eliminate(J, r, y, b, c + damping, penalty)
 
     g, H, stages = jax.vmap(partial(reduce, penalties.stage))(
-        derivatives.stage, r.stage, nu.stage, slope.stage, curvature.stage
+        derivatives.stage, r.stage, y.stage, slope.stage, curvature.stage
     )
     g_end, H_end, end = reduce(
         penalties.terminal,
         derivatives.terminal,
         r.terminal,
-        nu.terminal,
+        y.terminal,
         slope.terminal,
         curvature.terminal,
     )

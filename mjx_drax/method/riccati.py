@@ -47,11 +47,11 @@ from mjx_drax.method.model import Linearization, QuadraticCost
 class Factorization:
     """What the backward recursion leaves at every stage.
 
-    K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky factors
-    of Quu and S / mu; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
+    gains K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky
+    factors of Quu and S / mu; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
     """
 
-    K: Array
+    gains: Array
     kff: Array
     Lu: Array
     Ls: Array
@@ -88,19 +88,19 @@ class Start:
 class Step:
     """What a chain moves by.
 
-    Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise nx, nu alike, or None; the
-    multipliers' step `rate` = mu (h + J d), (K, ndx); feedback K (K, nu, ndx). Where x_0 is free,
-    w and its noise, (n0,), and the step dx_0 that they make, with noise beside, (ndx, 1 or 2).
+    Newton step dx (K, ndx) at x_1..x_K and du (K, nu); noise_x and noise_u alike, or None; the
+    multipliers' step `rate` = mu (h + J d), (K, ndx); feedback gains (K, nu, ndx). Where x_0 is
+    free, w and its noise, (n0,), and the step dx_0 that they make, noise beside, (ndx, 1 or 2).
     """
 
     dx: Array
     du: Array
-    nx: Array | None
-    nu: Array | None
+    noise_x: Array | None
+    noise_u: Array | None
     rate: Array
-    K: Array
+    gains: Array
     start: Array | None = None
-    nstart: Array | None = None
+    noise_start: Array | None = None
     first: Array | None = None
 
 
@@ -156,7 +156,7 @@ def solve_and_sample(
     ) -> tuple[Array, Array]:
         """F, and the columns f of the step and of the noise."""
         step = model.h + model.B @ factors.kff
-        closed = model.A + model.B @ factors.K
+        closed = model.A + model.B @ factors.gains
         right = [closed, step + soft * (multiplier - factors.p)]
         if white is None:
             out = solve(factors.Ls, jnp.column_stack(right))
@@ -173,13 +173,14 @@ def solve_and_sample(
     after = affine_recursion(F, f)  # dx_1..dx_K, of dx_0 = 0 or with f_0 of the other one
     zeroth = jnp.zeros_like(after[:1]) if first is None else first[None]
     before = jnp.concatenate([zeroth, after[:-1]])
-    controls = factors.K @ before
+    controls = factors.gains @ before
     dx, du = after[..., 0], controls[..., 0] + factors.kff
-    nx, nu = None, None
+    noise_x, noise_u = None, None
     if white is not None:
-        nx, nu = after[..., 1], controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
+        noise_x = after[..., 1]
+        noise_u = controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
     costate = jnp.einsum("kij,kj->ki", factors.P, dx) + factors.p
-    return Step(dx, du, nx, nu, costate - multipliers, factors.K)
+    return Step(dx, du, noise_x, noise_u, costate - multipliers, factors.gains)
 
 
 @vmapped_as_kernel(result=Step)
@@ -215,4 +216,4 @@ def newton_with_start(
     first = start.E @ w
     step = solve_and_sample(model, factors, multipliers, penalty, white, first)
     noise = None if start.white is None else w[:, 1]
-    return replace(step, start=w[:, 0], nstart=noise, first=first)
+    return replace(step, start=w[:, 0], noise_start=noise, first=first)

@@ -538,7 +538,7 @@ def _direction(
         d = Trajectory(step.dx, step.du, slack, step.start)
         rates = Multipliers(step.rate, Stagewise(rate, rate_end))
         finite = jnp.isfinite(sum(jnp.sum(a) for a in jax.tree.leaves((d, rates))))
-        return finite, (d, rates, step.K)
+        return finite, (d, rates, step.gains)
 
     more = [damping]
     for _ in range(TRIES - 1):

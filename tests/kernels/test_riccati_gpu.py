@@ -37,7 +37,7 @@ def batch(chains, dtype, noisy=True, ndx=NDX):
 
 
 def agree(seen, wanted, tolerance):
-    for name in ("dx", "du", "nx", "nu", "rate", "K"):
+    for name in ("dx", "du", "noise_x", "noise_u", "rate", "gains"):
         a, b = seen[name], getattr(wanted, name)
         assert (a is None) == (b is None), name
         if a is not None:

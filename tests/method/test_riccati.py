@@ -92,7 +92,7 @@ def test_noise_covariance_is_exactly_the_inverse_of_M(mu):
         drawn = White(numbers[: K * NU].reshape(K, NU), numbers[K * NU :].reshape(K, NDX))
         _, factors = factorize(model, cost, multipliers, mu)
         step = solve_and_sample(model, factors, multipliers, mu, drawn)
-        return jnp.concatenate([step.nx.ravel(), step.nu.ravel()])
+        return jnp.concatenate([step.noise_x.ravel(), step.noise_u.ravel()])
 
     zero = np.zeros(K * (NDX + NU))
     assert not np.any(noise(zero))
@@ -108,7 +108,7 @@ def test_sampled_noise_is_white_in_the_metric():
     drawn_white = jax.vmap(white)(jax.random.split(KEY, samples))
     over_noise = jax.jit(jax.vmap(newton, (None, None, None, None, 0)))
     step = over_noise(model, cost, multipliers, mu, drawn_white)
-    n = np.hstack([step.nx.reshape(samples, -1), step.nu.reshape(samples, -1)])
+    n = np.hstack([step.noise_x.reshape(samples, -1), step.noise_u.reshape(samples, -1)])
     whitened = n @ np.linalg.cholesky(H + mu * J.T @ J)  # L'n ~ N(0, I) for M = L L'
     np.testing.assert_allclose(whitened.mean(0), 0, atol=6 / samples**0.5)
     covariance = whitened.T @ whitened / samples
@@ -128,9 +128,9 @@ def test_without_white_numbers_there_is_no_noise():
     model, cost, multipliers, mu, numbers = batch(3, np.float64)
     noisy = jax.jit(jax.vmap(newton))(model, cost, multipliers, mu, numbers)
     plain = jax.jit(jax.vmap(newton))(model, cost, multipliers, mu)
-    assert plain.nx is None
-    assert plain.nu is None
-    for name in ("dx", "du", "rate", "K"):
+    assert plain.noise_x is None
+    assert plain.noise_u is None
+    for name in ("dx", "du", "rate", "gains"):
         np.testing.assert_allclose(
             getattr(plain, name), getattr(noisy, name), rtol=1e-9, atol=1e-9, err_msg=name
         )
@@ -149,7 +149,7 @@ def test_maps_may_be_nested_and_arguments_shared():
     fold = jax.tree.map(lambda a: a.reshape(2, 3, *a.shape[1:]), (model, multipliers, numbers))
     inner = jax.vmap(newton, (0, None, 0, None, 0))
     nested = jax.jit(jax.vmap(inner, (0, None, 0, None, 0)))(fold[0], cost, fold[1], mu[0], fold[2])
-    for name in ("dx", "rate", "K"):
+    for name in ("dx", "rate", "gains"):
         expected = np.stack([getattr(step, name) for step in steps])
         np.testing.assert_allclose(
             getattr(nested, name).reshape(expected.shape), expected, rtol=1e-9, atol=1e-9
@@ -169,7 +169,7 @@ def lqr(A, B, cost):
 
 def test_stiff_penalty_gives_lqr():
     model, cost, multipliers = drawn(5)
-    gains = jax.jit(factorize)(model, cost, multipliers, 1e10)[1].K
+    gains = jax.jit(factorize)(model, cost, multipliers, 1e10)[1].gains
     np.testing.assert_allclose(gains, lqr(model.A, model.B, cost), rtol=1e-6, atol=1e-6)
 
 
@@ -192,6 +192,6 @@ def test_long_horizon_gives_the_stationary_lqr():
         every(R),
     )
     before, factors = jax.jit(factorize)(model, cost, np.zeros((long, NDX)), 1e10)
-    np.testing.assert_allclose(factors.K[0], stationary, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(factors.gains[0], stationary, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(factors.P[0], P, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(before[0], P, rtol=1e-6, atol=1e-6)
