@@ -678,7 +678,7 @@ def _iterated(
     """
     keepers = len(age) - explorers
     if polish is None:  # one loop for all: where f has contacts, each takes long to compile
-        return _flowed(flow, heated, problem, state, age, iterations, explorers)
+        return _flow_iterated(flow, heated, problem, state, age, iterations, explorers)
     kept, others = (
         jax.tree.map(lambda a, part=part: a[part], state)
         for part in (slice(keepers), slice(keepers, None))
@@ -689,12 +689,12 @@ def _iterated(
     kept = loop((kept, own), shared, 0, iterations, diagnose=False)[0]
     if not explorers:
         return kept
-    others = _flowed(flow, heated, problem, others, age[keepers:], iterations, explorers)
+    others = _flow_iterated(flow, heated, problem, others, age[keepers:], iterations, explorers)
     whole: State = jax.tree.map(lambda *parts: jnp.concatenate(parts), kept, others)
     return whole
 
 
-def _flowed(
+def _flow_iterated(
     flow: Langevin,
     heated: Langevin,
     problem: Problem,

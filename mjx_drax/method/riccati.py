@@ -48,7 +48,7 @@ class Factorization:
     """What the backward recursion leaves at every stage.
 
     gains K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky
-    factors of Quu and S / mu; P (K, ndx, ndx) and p (K, ndx), the value function where the stage leads to.
+    factors of Quu and S / mu; P (K, ndx, ndx) and p (K, ndx), the value function after the stage.
     """
 
     gains: Array

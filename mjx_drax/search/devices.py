@@ -70,7 +70,7 @@ def mesh_for(count: int, devices: int = 1) -> Mesh | None:
     return Mesh(np.array(used).ravel(), ("share",))
 
 
-def spread(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Callable[..., Any]:
+def split_over(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Callable[..., Any]:
     """program(rows, *whole, *numbers) as a function (rows, *numbers) of all rows.
 
     Every device works on its share of the rows, all at the same time. A GPU's program with loops

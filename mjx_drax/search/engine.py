@@ -50,7 +50,7 @@ from mjx_drax.search.chains import (
 )
 from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
-from mjx_drax.search.devices import gathered, spread
+from mjx_drax.search.devices import gathered, split_over
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import (
@@ -513,7 +513,7 @@ class Search:
             self.flow, Scale(cost, noise), indices, self.chains, self.polish
         )
         program = partial(iterate, tail=settings.after > 0)
-        self.launch = spread(program, self.mesh, self.question[0])
+        self.launch = split_over(program, self.mesh, self.question[0])
 
     # Iterations
 

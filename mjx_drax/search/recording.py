@@ -86,7 +86,7 @@ class Tries:
 
 
 @dataclass(frozen=True)
-class Path:
+class ChainHistory:
     """What one chain went through, over the attempts that led to its answer.
 
     Attributes:
@@ -111,7 +111,7 @@ class Recording:
 
     attempts: list[Tries]
 
-    def path(self, chain: int) -> Path:
+    def history_of(self, chain: int) -> ChainHistory:
         """The chain's tries, the best of each attempt, up to the one that gave its answer."""
         found = [(i, *best) for i, a in enumerate(self.attempts) if (best := a.best(chain))]
         tries = [one for one in found if not self.attempts[one[0]].continues]
@@ -126,7 +126,7 @@ class Recording:
         def each(name: str) -> np.ndarray:
             return np.stack([getattr(shot, name)[place] for _, place, shot in shots])
 
-        return Path(
+        return ChainHistory(
             iteration=np.array([shot.iteration for *_, shot in shots]),
             sigma=np.array([shot.sigma for *_, shot in shots]),
             cost=each("cost"),

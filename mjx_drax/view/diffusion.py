@@ -27,7 +27,7 @@ from mjx_drax.physics.c_engine.states import between, finite, interpolated, move
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.search.recording import Path as ChainHistory
+from mjx_drax.search.recording import ChainHistory
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
@@ -107,7 +107,7 @@ def render_diffusion(
         require_whole("poses", poses)
     require_whole("chains", chains)
     video_path(path)
-    shown = [recording.path(chain) for chain in _chains(solution, chains)]
+    shown = [recording.history_of(chain) for chain in _chains(solution, chains)]
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
     width, height = even_size(size)

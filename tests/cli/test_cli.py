@@ -352,7 +352,7 @@ def test_a_checkpoint_is_gone_on_from(tmp_path, capsys, monkeypatch):
     main(arguments)
     assert "going on" not in capsys.readouterr().out
     first = Solution.load(tmp_path)
-    monkeypatch.setattr("mjx_drax.search.engine.spread", lambda *_: None)  # nothing can iterate
+    monkeypatch.setattr("mjx_drax.search.engine.split_over", lambda *_: None)  # nothing can iterate
     main(arguments)
     assert f"going on from {file}\n" in capsys.readouterr().out
     np.testing.assert_array_equal(Solution.load(tmp_path).trajectories.u, first.trajectories.u)

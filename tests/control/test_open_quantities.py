@@ -112,7 +112,7 @@ def test_less_is_left_of_a_free_duration_but_never_less_than_the_least():
                 parameters={"m": (1.0, 2.0)},
                 model_numbers=lambda model, p: {"body_mass": model.body_mass.at[1].set(p["m"])},
             ),
-            "numbers of the model, and MPC drives a robot",
+            "has model_numbers, and MPC cannot change the robot",
         ),
     ],
 )

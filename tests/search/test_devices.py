@@ -72,7 +72,7 @@ def overlap(compiles):
         most.append(len(busy))
         busy.pop()
         return rows
-    devices.spread(program, devices.mesh_for(8, count))(jnp.zeros(8), compiles=compiles)
+    devices.split_over(program, devices.mesh_for(8, count))(jnp.zeros(8), compiles=compiles)
     return max(most)
 
 assert overlap(False) == overlap(True) == count

@@ -327,7 +327,7 @@ def test_rollouts_follow_where_f_has_kinks(balls):
     assert kinked.certified
     assert kinked.iterations > plain.iterations
     for chain in range(16):  # recorded all the way
-        path = kinked.recording.path(chain)
+        path = kinked.recording.history_of(chain)
         np.testing.assert_array_equal(path.x[-1], kinked.trajectories.x[chain])
         assert path.iteration[-1] == kinked.iterations
 

@@ -51,7 +51,7 @@ def test_recording_does_not_change_the_answer(trapped: Solution) -> None:
 def test_a_path_begins_scattered_and_ends_at_the_answer(trapped: Solution) -> None:
     assert trapped.recording is not None
     for chain in range(3):
-        path = trapped.recording.path(chain)
+        path = trapped.recording.history_of(chain)
         np.testing.assert_array_equal(path.iteration, [0, 2, 4, 6, 8, 10])
         np.testing.assert_array_equal(path.x[-1], trapped.trajectories.x[chain])
         np.testing.assert_allclose(path.max_defect, path.defects.max(axis=1), rtol=1e-6)
@@ -66,9 +66,9 @@ def test_a_path_follows_the_best_try_of_each_attempt_up_to_the_answer() -> None:
     second = Tries(np.array([1, 2, 2]), [_snapshot(10, [9, 9, 9], [5, 5, 5])])
     second.snapshots.append(_snapshot(20, [6.0, 4.0, 3.0], [1e-6, 1e-6, 1e-6]))
     attempts = Recording([first, second])
-    assert list(attempts.path(0).iteration) == [0, 10]  # the second did not work for it
-    assert list(attempts.path(1).iteration) == [0, 10]  # the second was worse
-    path = attempts.path(2)  # two tries, and the last place's is the cheaper
+    assert list(attempts.history_of(0).iteration) == [0, 10]  # the second did not work for it
+    assert list(attempts.history_of(1).iteration) == [0, 10]  # the second was worse
+    path = attempts.history_of(2)  # two tries, and the last place's is the cheaper
     assert list(path.attempt) == [0, 0, 1, 1]
     assert list(path.cost) == pytest.approx([9.0, 0.1, 9.0, 3.0])
     assert list(path.x[:, 0, 0]) == [2.0, 12.0, 12.0, 22.0]
@@ -148,7 +148,7 @@ def test_colors_go_from_feasible_to_the_worst() -> None:
 def test_film_time_is_spent_where_knots_move() -> None:
     x = np.zeros((21, 3, 1))
     x[:, :, 0] = np.array([1.0, 2.0, 4.0]) * 0.3 ** np.arange(21)[:, None]
-    path = recording.Path(
+    path = recording.ChainHistory(
         iteration=np.arange(21),
         sigma=np.zeros(21),
         cost=np.ones(21),
@@ -163,10 +163,10 @@ def test_film_time_is_spent_where_knots_move() -> None:
     assert np.median(at) < 5.0
 
 
-def _timeline(iteration: list[int], attempt: list[int]) -> recording.Path:
+def _timeline(iteration: list[int], attempt: list[int]) -> recording.ChainHistory:
     count = len(iteration)
     numbers = np.ones(count)
-    return recording.Path(
+    return recording.ChainHistory(
         iteration=np.array(iteration),
         sigma=numbers,
         cost=numbers,
