@@ -66,6 +66,8 @@ class _Progress:
         """The best cost so far, and how many chains are feasible."""
         feasible = np.asarray(info.max_defect) < FEASIBLE
         self._best = np.asarray(info.cost)[feasible].min(initial=self._best)
+        if not np.isfinite(self._best):
+            return "no feasible chain yet"
         return f"best cost {self._best:.4g}, feasible {feasible.mean():.0%}"
 
 

@@ -94,6 +94,8 @@ def test_a_log_gets_lines_while_it_compiles_and_with_the_best_cost_after(monkeyp
 
     with Lines("arm") as report:
         assert told("arm: compiling, first iterations [0:00]")
+        report(10, 100, SimpleNamespace(max_defect=np.ones(4), cost=INFO.cost))
+        assert told("arm: iteration 10 of at most 100, no feasible chain yet [0:00]")
         clock.monotonic = lambda: 75.9
         report(20, 100, INFO)
         assert told("arm: iteration 20 of at most 100, best cost 5, feasible 50% [1:15]")
