@@ -17,6 +17,7 @@ from jax import Array
 
 from mjx_drax.base.errors import DraxError, require_part, require_whole, shown
 from mjx_drax.base.numbers import numbers
+from mjx_drax.kernels.pruning import pruned
 from mjx_drax.method.bounds import Bounds
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.metrics import Identity, Metric
@@ -272,7 +273,7 @@ def _slopes_at(problem: Problem, label: str, order: int, z: Array, knot: Knot) -
         seen = here.seen(x, u) if len(arguments) == 2 else here.seen(x)
         return jnp.asarray(function(*seen), float)
 
-    return _with_slopes(value, order)(z)
+    return _with_slopes(pruned(value), order)(z)
 
 
 def _with_slopes(

@@ -31,6 +31,7 @@ from jax import Array
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels import linalg
 from mjx_drax.kernels.compilation import compiled
+from mjx_drax.kernels.pruning import pruned
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
@@ -94,7 +95,7 @@ def _sizes(problem: Problem, knots: Trajectory, by: Any) -> Sizes:
         g, H = here.running.expand(at, len(reach), by, key)
         of_controls = jnp.zeros_like(g).at[ndx:].set(_step(g[ndx:], H[ndx:, ndx:], reach_u))
         steps = jnp.stack([jnp.zeros_like(g), _step(g, H, reach), of_controls])
-        now, moved, steered = jax.vmap(lambda dz: here.running(*at(dz)))(steps)
+        now, moved, steered = jax.vmap(pruned(lambda dz: here.running(*at(dz))))(steps)
         return now, jnp.fmin(now, moved), now - steered
 
     def end(x: Array, key: Array) -> tuple[Array, Array]:
@@ -103,7 +104,7 @@ def _sizes(problem: Problem, knots: Trajectory, by: Any) -> Sizes:
 
         step = _step(*last.terminal.expand(at, ndx, by, key), reach_x)
         steps = jnp.stack([jnp.zeros_like(step), step])
-        now, moved = jax.vmap(lambda dx: last.terminal(*at(dx)))(steps)
+        now, moved = jax.vmap(pruned(lambda dx: last.terminal(*at(dx))))(steps)
         return now, jnp.fmin(now, moved)
 
     keys = jax.random.split(jax.random.key(0), problem.horizon)
