@@ -62,7 +62,7 @@ from mjx_drax.control.open_quantities import (
     step_of,
 )
 from mjx_drax.control.shift import shifted
-from mjx_drax.kernels.compilation import compiled, keep_programs
+from mjx_drax.kernels.compilation import compiled, keep_programs, rarely_collected
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
@@ -328,7 +328,8 @@ class MPC:
         self.planner = _planner(structure, self.explorers)
         carried = _first(found.chains, self.explorers, self.seed, self._polish)
         self._plan = None
-        self._apply(carried, x, t, 0.0)  # compiles
+        with rarely_collected():
+            self._apply(carried, x, t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
         self._start = self._carried, self.latest
         self.statistics = Statistics()

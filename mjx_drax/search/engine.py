@@ -23,6 +23,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from mjx_drax.base.digests import digest
+from mjx_drax.kernels.compilation import rarely_collected
 from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
@@ -192,6 +193,7 @@ class Search:
         stage = self.stage
         return np.resize(stage.todo[stage.place : stage.place + self.size], self.size)
 
+    @rarely_collected()
     def _begin_search(self) -> None:
         """Initial knots of the first chunk, tried before anything long compiles."""
         family, everyone = self.family, np.arange(self.family.count)

@@ -93,7 +93,7 @@ def _class_named(name: Any, imports: bool) -> Any:
     if not isinstance(name, str):
         raise TypeError(f"{shown(name)} is no name of a class")
     module, _, cls = name.rpartition(":")
-    if not module:
+    if not module:  # a public name, wherever it lies: files hold names that outlive a move
         found = getattr(import_module("mjx_drax"), cls)
     elif imports:
         found = imported(name)

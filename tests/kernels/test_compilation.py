@@ -1,5 +1,6 @@
 """Options reach the compiler, those it does not know are left out; what is kept on disk."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -38,6 +39,14 @@ def test_the_compiler_gets_options_that_it_knows(monkeypatch, backend):
     assert program(3.0, times=2) == 12.0
     settings = {"compiler_options": options, "static_argnames": "times"}
     assert given == [settings]
+
+
+def test_garbage_is_looked_for_less_often_for_a_while():
+    usual = gc.get_threshold()
+    with pytest.raises(KeyError), compilation.rarely_collected():
+        assert gc.get_threshold()[0] == 100 * usual[0] > 0
+        raise KeyError
+    assert gc.get_threshold() == usual
 
 
 def test_there_are_no_options_where_jax_is_told_to_hurry():
