@@ -528,6 +528,8 @@ class Search:
     def _iterate(self) -> bool:
         """What is left of the iterations of an attempt; False if they are interrupted."""
         stage, flow = self.stage, self.flow
+        if stage.rollouts > 0:  # resumed after its iterations, which may have ended early
+            return True
         if self.family.alone and len(stage.began) == stage.attempt + stage.coolings:
             noisy = int(flow.iterations) if noise_at(flow, 0) > 0.0 else 0
             if self.recorder is not None:
