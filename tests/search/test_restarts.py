@@ -336,7 +336,7 @@ def test_rollouts_follow_where_f_has_kinks(balls):
 def test_where_all_that_a_round_changes_is_worse_a_share_of_it_helps(balls, monkeypatch):
     solver = Restarts(attempts=1, polish=Polish(iterations=0))
     in_part = solve(balls[1], chains=8, solver=solver)
-    monkeypatch.setattr("mjx_drax.search.replayer.SHARES", ())
+    monkeypatch.setattr("mjx_drax.search.replayer.SHARES", (1.0,))  # all of it once more
     whole = solve(balls[1], chains=8, solver=solver)
     assert in_part.feasible.all()
     assert (in_part.cost < whole.cost).all()
