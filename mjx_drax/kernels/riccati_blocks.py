@@ -197,6 +197,6 @@ def tile(n: int) -> int:
 
 def padded(a: Array, *sizes: int) -> Array:
     """Blocks (..., *shape) with zeros around, up to `sizes`."""
-    batch = a.ndim - len(sizes)
-    more = [size - there for size, there in zip(sizes, a.shape[batch:], strict=True)]
-    return jnp.pad(a, [(0, 0)] * batch + [(0, by) for by in more])
+    leading = a.ndim - len(sizes)
+    more = [size - there for size, there in zip(sizes, a.shape[leading:], strict=True)]
+    return jnp.pad(a, [(0, 0)] * leading + [(0, by) for by in more])

@@ -117,9 +117,8 @@ def newton_steps(
         interpret: run it without a GPU.
 
     Returns:
-        dx, rate and noise_x (chains, K, ndx), du and noise_u (chains, K, nu), gains
-            (chains, K, nu, ndx); noise_x and noise_u
-        are None without noise.
+        dx, rate and noise_x (chains, K, ndx), du and noise_u (chains, K, nu), and gains
+        (chains, K, nu, ndx); noise_x and noise_u are None without noise.
     """
     chains, horizon, n, m = B.shape
     noisy = xi_u is not None

@@ -157,8 +157,12 @@ def panel_figure(
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches."""
-    return Figure((width, height), DPI, layout="constrained", facecolor="white")
+    """An empty figure of a size in inches.
+
+    It has whole pixels and a quarter: versions of matplotlib cut or round what is left.
+    """
+    size = (round(width * DPI) + 0.25) / DPI, (round(height * DPI) + 0.25) / DPI
+    return Figure(size, DPI, layout="constrained", facecolor="white")
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
