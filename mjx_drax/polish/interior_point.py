@@ -661,8 +661,9 @@ def _line_search(
         bent = partial(_bent, problem, model, gains, new, merits[2].dynamics)
         return jax.lax.cond(first, bent, lambda: new), (new, merits)
 
-    # in a loop, so that f compiles once
-    both = jax.lax.scan(tried, straight, jnp.array([True, False]))[1]
+    # where f is long, as with contacts, in a loop: so it compiles once
+    unroll = 1 if problem.dynamics.kinked else 2
+    both = jax.lax.scan(tried, straight, jnp.array([True, False]), unroll=unroll)[1]
     candidates, (costs, penalties, h) = jax.tree.map(
         lambda a: jnp.concatenate([a[1, :-1], a[0]]), both
     )
