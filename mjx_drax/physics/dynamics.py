@@ -370,25 +370,47 @@ class MjxDynamics(Dynamics):
         return observe
 
 
-_TRACED = ("model", "dt", "derivatives", "time")
+_TRACED = ("dt", "derivatives", "time")
 _STATIC = ("substeps", "structure", "free_step", "numbers")
 
 
 def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """The model's arrays are children themselves, found once.
+
+    MJX flattens a model in Python, which takes a millisecond or two, at every call of a compiled
+    function.
+    """
+    model, found = dynamics.model, dynamics.__dict__.get("_arrays")
+    if found is None or found[0] is not model:  # `at` puts another model into a copy
+        found = model, *jax.tree.flatten(model, is_leaf=lambda leaf: leaf is None)
+        object.__setattr__(dynamics, "_arrays", found)
+    _, arrays, tree = found
     traced, static = (tuple(getattr(dynamics, n) for n in names) for names in (_TRACED, _STATIC))
-    return traced, static
+    return (*arrays, *traced), (*static, tree)
 
 
-def _unflatten(static: tuple[Any, ...], traced: Iterable[Any]) -> MjxDynamics:
+def _unflatten(static: tuple[Any, ...], children: Iterable[Any]) -> MjxDynamics:
     """The dynamics with the structure they had, which traced numbers could not give."""
+    *others, tree = static
+    *arrays, dt, derivatives, time = children
     dynamics = object.__new__(MjxDynamics)
-    values = zip((*_TRACED, *_STATIC), (*traced, *static), strict=True)
-    for name, value in (*values, ("mj_model", None), ("origin", None)):
+    model = jax.tree.unflatten(tree, arrays)
+    values = dict(zip((*_TRACED, *_STATIC), (dt, derivatives, time, *others), strict=True))
+    values |= {"model": model, "_arrays": (model, arrays, tree), "mj_model": None, "origin": None}
+    for name, value in values.items():
         object.__setattr__(dynamics, name, value)
     return dynamics
 
 
-jax.tree_util.register_pytree_node(MjxDynamics, _flatten, _unflatten)
+def _flatten_with_keys(dynamics: MjxDynamics) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+    children, static = _flatten(dynamics)
+    paths = jax.tree_util.tree_leaves_with_path(dynamics.model, is_leaf=lambda leaf: leaf is None)
+    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
+    keys = [jax.tree_util.GetAttrKey(name) for name in (*names, *_TRACED)]
+    return list(zip(keys, children, strict=True)), static
+
+
+jax.tree_util.register_pytree_with_keys(MjxDynamics, _flatten_with_keys, _unflatten, _flatten)
 
 
 def mujoco_model(dynamics: Dynamics) -> mujoco.MjModel | None:

@@ -65,7 +65,9 @@ class AttemptSoFar:
 
     def gained(self, places: np.ndarray) -> int:
         """How many chains these places make done that were not."""
-        return int((~self.kept[np.unique(self.owners[places])]).sum())
+        done = np.zeros(len(self.kept), bool)
+        done[self.owners[places]] = True
+        return int((done & ~self.kept).sum())
 
     def missing(self, places: np.ndarray) -> float:
         """How many more chains must become done if these places make theirs done."""
@@ -90,7 +92,7 @@ class AttemptSoFar:
         decide by chance.
         """
         if self.missing(self.near & ~self.active) <= 0.0:
-            return len(np.unique(self.owners)) < len(self.owners)
+            return int(np.bincount(self.owners).max()) > 1
         if self.missing(self.hopeful) <= 0.0:
             return False
         now, before = self.gained(self.near), self.gained(self.before <= self.bar)

@@ -87,7 +87,8 @@ def split_over(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> C
         launch that `compiles`, devices take turns if the first one's program serves the others.
     """
     if mesh is None:
-        return lambda rows, *numbers, compiles=False: program(rows, *whole, *numbers)
+        there = jax.device_put(whole)  # once: dozens of numbers take longer than an iteration
+        return lambda rows, *numbers, compiles=False: program(rows, *there, *numbers)
     copies = {device: jax.device_put(whole, device) for device in mesh.local_devices}
 
     def launch(rows: Any, *numbers: Any, compiles: bool = False) -> Any:
@@ -115,6 +116,11 @@ def _cached() -> bool:
 def gathered(tree: Tree, mesh: Mesh | None) -> Tree:
     """The arrays that are split over a mesh, whole on the first device of this process."""
     return tree if mesh is None else jax.tree.map(partial(_gathered, mesh), tree)
+
+
+def on_host(tree: Any, mesh: Mesh | None) -> Any:
+    """The arrays of a tree in numpy, whole; they are fetched together."""
+    return jax.device_get(gathered(tree, mesh))
 
 
 def _share(leaf: Any, mesh: Mesh, device: jax.Device) -> Array:

@@ -51,7 +51,7 @@ from mjx_drax.search.chains import (
 )
 from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
-from mjx_drax.search.devices import gathered, split_over
+from mjx_drax.search.devices import gathered, on_host, split_over
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import (
@@ -211,7 +211,7 @@ class Search:
         zeros: Any = np.zeros(rows, knots.u.dtype)
         info = Info.of(zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
-            _, info = jax.block_until_ready(self._iterated(state, 0, 0))
+            _, info = self._iterated(state, 0, 0)
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
         now = Chains.of(state, info, np.full(rows, -1))
         kept = None if family.alone else unset(now, family.count * self.chains)
@@ -276,7 +276,7 @@ class Search:
         knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, stage.heated, indices, stage.cost_scale)
         state = self._begun(stage.attempt, knots, keys)
-        _, info = jax.block_until_ready(self._iterated(state, 0, 0))
+        _, info = self._iterated(state, 0, 0)
         now = Chains.of(state, info, np.full(len(owners), -1))
         ones = np.ones(len(owners))
         self.stage = replace(
@@ -406,13 +406,10 @@ class Search:
         does not wait. While no chain at the best cost has settled, or none is sound, those there
         get more.
         """
-        polish, state = self.polish, chains.state
+        polish = self.polish
         assert polish is not None
-        done, active, alive = (
-            np.asarray(gathered(a, self.mesh))
-            for a in (state.polish.iterations, state.polish.active, state.alive)
-        )
-        moves, most = active & alive, polish.iterations - 1
+        moves = self._moving(chains.state)
+        done, most = on_host(chains.state.polish.iterations, self.mesh), polish.iterations - 1
         left = moves & (done < most)
         if left.sum() > STRAGGLERS * self.chains:
             return left
@@ -420,6 +417,12 @@ class Search:
         bar = done_up_to(costs, size, CHEAPER, self.stage.cost_scale[0])
         near = costs <= bar if chains.sound.any() else moves
         return moves & near & (done < polish.patience * most) & (moves | ~near).all()
+
+    def _moving(self, state: State) -> np.ndarray:
+        """Which chains the polish still moves, (rows,)."""
+        flags = state.polish.optimal, state.polish.stalled, state.alive
+        optimal, stalled, alive = on_host(flags, self.mesh)
+        return np.asarray(alive & ~(optimal | stalled))
 
     def _sound_costs(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
         """Costs of those problems' chains, from their floors, (len(indices), chains)."""
@@ -520,10 +523,10 @@ class Search:
     # Iterations
 
     def _iterated(self, state: State, start: int, stop: int) -> tuple[State, Info]:
-        """Iterations start..stop-1 on all devices, where the states then stay."""
+        """Iterations start..stop-1 on all devices, where the states then stay; diagnostics here."""
         rows = state, self.question[1]
         state, info = self.launch(rows, start, stop, compiles=start == stop == 0)
-        return state, gathered(info, self.mesh)
+        return state, on_host(info, self.mesh)
 
     def _iterate(self) -> bool:
         """What is left of the iterations of an attempt; False if they are interrupted."""
@@ -543,13 +546,13 @@ class Search:
                 stage, now = self.stage, self.stage.now
                 every = self._report_every(total)
                 stop = min(stage.step - stage.step % every + every, total)
-                state, info = jax.block_until_ready(self._iterated(now.state, stage.step, stop))
+                state, info = self._iterated(now.state, stage.step, stop)
                 if stage.attempt == stage.place == stage.step == 0:
-                    died_at = np.asarray(gathered(state.died_at, self.mesh))
+                    died_at = on_host(state.died_at, self.mesh)
                     if (died_at == 0).all():
                         knots = gathered(now.state.trajectory, self.mesh)
                         require_sound(flow, self.family.at(0), knots)
-                feasible = np.asarray(info.max_defect) < FEASIBLE
+                feasible = info.max_defect < FEASIBLE
                 since = np.where(now.feasible_since < 0, before + stop, now.feasible_since)
                 asked = stage.step % self._usual_report(total) == 0
                 costs = now.sound_cost if asked else stage.before
@@ -559,7 +562,7 @@ class Search:
                     self.stage = replace(self.stage, coolings=self.stage.coolings + 1)
                     self._begin_chunk()
                     return self._iterate()
-                if not np.asarray(gathered(state.alive, self.mesh)).any():
+                if not on_host(state.alive, self.mesh).any():
                     self._require_some(now)
                     break
         except KeyboardInterrupt:  # the chains as they were at the last report
@@ -581,7 +584,7 @@ class Search:
         """Complain where all chains of a first attempt died, and none of them is an answer."""
         if self.family.alone and self.stage.attempt == 0 and not now.feasible.any():
             knots = gathered(now.state.trajectory, self.mesh)
-            died_at = np.asarray(gathered(now.state.died_at, self.mesh))
+            died_at = on_host(now.state.died_at, self.mesh)
             require_alive(self.flow, self.family.at(0), replace(knots, slack=None), died_at)
 
     def _waits(self, now: Chains) -> bool:
@@ -599,7 +602,7 @@ class Search:
             return True
         if stage.finishing:
             return bool(self._unfinished(now).any())
-        active = np.asarray(gathered(now.state.polish.active & now.state.alive, self.mesh))
+        active = self._moving(now.state)
         if stage.attempt + 1 < settings.attempts or (self._ends_early and stage.attempt > 0):
             bar, floor = self._done_up_to(self.indices, now).item(), stage.floor[0]
             kept = np.zeros(self.chains, bool)
@@ -787,7 +790,7 @@ class Search:
             self.recorder.restore(saved["recorder"])
         if not saved["ended"]:
             self._settle(stage.attempt, stage.heated, self.indices, stage.cost_scale)
-            jax.block_until_ready(self._iterated(state, 0, 0))  # just compiles
+            self._iterated(state, 0, 0)  # just compiles
         return saved["solve_time"], saved["ended"]
 
     def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from mjx_drax.kernels.pruning import pruned
 from mjx_drax.models import path
 from mjx_drax.physics import dynamics as mjx_dynamics
 from mjx_drax.problem.differentiators import Autodiff, InScalars
+from mjx_drax.problem.trajectory import Knot
 
 RNG = np.random.default_rng(0)
 
@@ -155,7 +156,33 @@ def test_dynamics_survive_as_a_pytree():
     again = jax.tree.unflatten(tree, leaves)
     assert again.structure == dynamics.structure
     assert (again.dt, again.substeps) == (dynamics.dt, dynamics.substeps)
+    assert jax.tree.structure(again) == tree
+    paths, _ = zip(*jax.tree_util.tree_leaves_with_path(dynamics), strict=True)
+    names = [jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
+    assert leaves[names.index("opt.gravity")] is dynamics.model.opt.gravity
+    assert leaves[names.index("dt")] is dynamics.dt
     many = jax.tree.map(lambda a: jnp.stack([jnp.asarray(a)] * 2), dynamics)
     x, u = jnp.array([0.3, 0.2]), jnp.array([0.1])
     seen = jax.vmap(lambda dynamics: dynamics.step(x, u))(many)
     np.testing.assert_allclose(seen, [after(dynamics)] * 2, rtol=1e-6)
+
+
+def test_flattened_dynamics_have_the_numbers_of_their_knot():
+    dynamics = task("pendulum").dynamics
+    steered = dynamics.steered(
+        False, lambda model, mass: {"body_mass": mass * model.body_mass}, ["body_mass"]
+    )
+    jax.tree.leaves(steered)  # found once, but not kept for another model
+    knot = Knot(jnp.zeros(()), jnp.zeros((), int), jnp.array(0.1), parameters=jnp.array(3.0))
+    heavy = steered.at(knot)
+    leaves, tree = jax.tree.flatten(heavy)
+    again = jax.tree.unflatten(tree, leaves)
+    for seen in (heavy, again):
+        np.testing.assert_array_equal(seen.model.body_mass, 3.0 * dynamics.model.body_mass)
+
+
+def test_a_model_is_flattened_once(monkeypatch):
+    dynamics = task("pendulum").dynamics
+    jax.tree.leaves(dynamics)
+    monkeypatch.setattr(jax.tree, "flatten", None)
+    assert len(jax.tree.leaves(dynamics)) > 100
