@@ -245,9 +245,9 @@ def step(
     residual, scales = residual_of(problem, model, v)
     learned = before.secant
     if isinstance(learned, Secant):
-        learned = learned.updated(
-            problem, state.trajectory, derivatives, state.multipliers, learns=before.size > 0.0
-        )
+        at = problem, state.trajectory, derivatives, state.multipliers
+        moves = jnp.concatenate([scales.x, scales.u])
+        learned = learned.updated(*at, moves, learns=before.size > 0.0)
         if not problem.dynamics.kinked:
             learned = _measured(problem, state, learned, derivatives.cost, residual, scales)
     total = jnp.maximum(residual.total, before.promise)

@@ -1,4 +1,4 @@
-"""Second-order information from first derivatives: a symmetric rank-one update for each stage.
+"""Second-order information from first derivatives: a symmetric matrix that each stage learns.
 
 Gauss-Newton's Hessian leaves out the curvature of dynamics and constraints, lambda'd2h, and that of
 residuals. What is left out is a sum over stages, so a small matrix B_k at each stage can learn it.
@@ -6,10 +6,11 @@ After a step s = (dx_k, du_k), with the stage's Lagrangian l + lambda'f + nu'g a
 
     y = grad_k(z + s) - grad_k(z),    r = y - (H_k + B_k) s,    B_k <- B_k + r r' / (r's)
 
-(the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984). It needs no derivatives
-beyond those that Gauss-Newton has anyway, so programs compile no longer for it. Far from an optimum
-what stages have learned is wrong one step later, so it is used near one only. Where a chain stays
-close to one for long and f is smooth, B_k is measured now and then (`curvature`), and learns on.
+(the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984), or, where that explodes,
+B_k changes by least (`least_change`). It needs no derivatives beyond those that Gauss-Newton has
+anyway, so programs compile no longer for it. Far from an optimum what stages have learned is wrong
+one step later, so it is used near one only. Where a chain stays close to one for long and f is
+smooth, B_k is measured now and then (`curvature`), and learns on.
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ from mjx_drax.method.model import Derivatives, Multipliers, QuadraticCost
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 
-SKIP = 1e-4
-"""Smallest share of sum |r_i s_i| that r's must have: below it r r' / (r's) explodes."""
+ALIGNED = 0.01
+"""Smallest cosine of r and s for a rank-one update, whose size is |r| / |s| over this cosine. What
+stages know is otherwise lost by one step: an exact B then differs by third derivatives alone, and r
+may point anywhere."""
 
 NOISE = 10.0
 """Changes of slopes below so many roundings of their terms teach nothing."""
@@ -67,9 +70,13 @@ class Secant:
         knots: Trajectory,
         derivatives: Derivatives,
         multipliers: Multipliers,
+        moves: Array,
         learns: Array,
     ) -> Secant:
-        """What is known at new knots; B stays where not `learns`."""
+        """What is known at new knots; B stays where not `learns`.
+
+        `moves` (n,) is how far coordinates move; see `least_change`.
+        """
         dynamics, cost, stage, _ = derivatives
         J = jnp.concatenate([jnp.concatenate([dynamics.A, dynamics.B], axis=2), stage], axis=1)
         g = jnp.concatenate([cost.gx[:-1], cost.gu], axis=1)
@@ -81,7 +88,9 @@ class Secant:
         y = g - self.g + jnp.einsum("kij,ki->kj", J - self.J, forces)
         terms = jnp.abs(g) + jnp.einsum("kij,ki->kj", jnp.abs(J), jnp.abs(forces))
         noise = NOISE * jnp.finfo(g.dtype).eps * terms
-        learned = jax.vmap(_rank_one)(self.B, blocks(cost) + self.B, s, y, noise)
+        r = y - jnp.einsum("kij,kj->ki", blocks(cost) + self.B, s)
+        r = jnp.where((jnp.abs(r) > noise).any(axis=1, keepdims=True), r, 0.0)
+        learned = self.B + jax.vmap(least_change, (0, 0, None))(r, s, moves)
         B = jnp.where(learns, learned, self.B)
         return Secant(B, J, g, x, knots.u, self.close)
 
@@ -98,12 +107,20 @@ def with_curvature(cost: QuadraticCost, B: Array) -> QuadraticCost:
     )
 
 
-def _rank_one(B: Array, H: Array, s: Array, y: Array, noise: Array) -> Array:
-    """B + r r' / (r's) with r = y - H s; B where that would explode, or where r is noise."""
-    r = y - H @ s
-    slope = r @ s
-    takes = (jnp.abs(slope) > SKIP * (jnp.abs(r) @ jnp.abs(s))) & (jnp.abs(r) > noise).any()
-    return B + jnp.where(takes, 1.0, 0.0) * jnp.outer(r, r) / jnp.where(takes, slope, 1.0)
+def least_change(r: Array, s: Array, moves: Array) -> Array:
+    """A symmetric matrix D (n, n) with D s = r: that of rank one, or else the least one.
+
+    Where r and s are nearly orthogonal, r r' / (r's) explodes. The least one is Powell's (1970), as
+    measured by how far coordinates move, `moves` (n,). It is no larger than 3 |r| / |s|.
+    """
+    r, s = r * moves, s / moves
+    slope, length = r @ s, s @ s
+    aligned = jnp.abs(slope) > ALIGNED * jnp.sqrt((r @ r) * length)
+    of_rank_one = jnp.outer(r, r) / jnp.where(aligned, slope, 1.0)
+    length = jnp.where(length > 0.0, length, 1.0)
+    cross = jnp.outer(r, s) / length
+    least = cross + cross.T - (slope / length) * (jnp.outer(s, s) / length)
+    return jnp.where(aligned, of_rank_one, least) / jnp.outer(moves, moves)
 
 
 def blocks(cost: QuadraticCost) -> Array:

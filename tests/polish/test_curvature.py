@@ -12,7 +12,7 @@ from mjx_drax import LogBarrier, Trajectory, from_function
 from mjx_drax.method.model import Multipliers, expand
 from mjx_drax.method.schedules import Weights
 from mjx_drax.polish.curvature import measured_hessian, with_exact_hessian
-from mjx_drax.polish.secant import Secant, with_curvature
+from mjx_drax.polish.secant import Secant, least_change, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.trajectory import Stagewise
 
@@ -101,13 +101,16 @@ def stage_blocks(cost):
     return np.stack(rows)
 
 
+MOVES = jnp.ones(N)
+
+
 def learned(problem, steps):
     """What is learned from so many steps, and what there was to learn."""
     secant = Secant.none(problem)
     for i in range(steps + 1):
         knots, multipliers = somewhere(problem, i)
         found = derivatives(problem, knots, multipliers)
-        secant = secant.updated(problem, knots, found, multipliers, learns=jnp.asarray(i > 0))
+        secant = secant.updated(problem, knots, found, multipliers, MOVES, learns=jnp.asarray(i > 0))
     exact = with_exact_hessian(problem, knots, multipliers, found.cost, Autodiff())
     return secant, found.cost, exact
 
@@ -154,10 +157,52 @@ def test_nothing_is_learned_from_standing_still_or_from_rounding():
     moved = replace(knots, u=knots.u + 1e-15)
     for near in (knots, moved):
         found = derivatives(problem, near, multipliers)
-        again = secant.updated(problem, near, found, multipliers, learns=jnp.asarray(True))
+        again = secant.updated(problem, near, found, multipliers, MOVES, learns=jnp.asarray(True))
         np.testing.assert_array_equal(again.B, secant.B)
     far, _ = somewhere(problem, 50)
     found = derivatives(problem, far, multipliers)
-    still = secant.updated(problem, far, found, multipliers, learns=jnp.asarray(False))
+    still = secant.updated(problem, far, found, multipliers, MOVES, learns=jnp.asarray(False))
     np.testing.assert_array_equal(still.B, secant.B)
     np.testing.assert_array_equal(still.x, problem.with_start(far)[:-1])
+
+
+@pytest.mark.slow
+def test_what_is_known_survives_small_steps_whatever_their_direction():
+    problem = posed(
+        lambda x, u: jnp.array([x[0] * jnp.exp(u[0]), jnp.sin(x[0] * x[1]) + u[0] ** 3])
+    )
+    knots, multipliers = somewhere(problem, 1)
+    found = derivatives(problem, knots, multipliers)
+    exact = with_exact_hessian(problem, knots, multipliers, found.cost, Autodiff())
+    known = stage_blocks(exact) - stage_blocks(found.cost)
+    here = Secant.none(problem).updated(
+        problem, knots, found, multipliers, MOVES, learns=jnp.asarray(False)
+    )
+    here = replace(here, B=known)
+
+    @jax.jit
+    def after(key):
+        of_x, of_u = jax.random.split(key)
+        x = knots.x + 1e-5 * jax.random.normal(of_x, knots.x.shape)
+        near = replace(knots, x=x, u=knots.u + 1e-5 * jax.random.normal(of_u, knots.u.shape))
+        found = derivatives(problem, near, multipliers)
+        return here.updated(problem, near, found, multipliers, MOVES, jnp.asarray(True)).B
+
+    changes = np.abs(jax.vmap(after)(jax.random.split(jax.random.key(0), 1000)) - known)
+    assert 1e-7 < np.median(changes.max(axis=(1, 2, 3)))
+    assert changes.max() < 0.02
+
+
+def test_what_is_learned_has_no_units():
+    rng = np.random.default_rng(0)
+    units = jnp.array([1e3, 1e-2, 30.0])
+    for i in range(20):
+        s = rng.normal(size=N)
+        r = rng.normal(size=N)
+        if i % 2:  # orthogonal to the step
+            r -= r @ s / (s @ s) * s
+        D = least_change(jnp.asarray(r), jnp.asarray(s), MOVES)
+        np.testing.assert_allclose(D @ s, r, atol=1e-9)
+        np.testing.assert_allclose(D, D.T)
+        other = least_change(r / units, s * units, units)
+        np.testing.assert_allclose(other * jnp.outer(units, units), D, rtol=1e-9, atol=1e-12)
