@@ -523,7 +523,7 @@ class Search:
     # Iterations
 
     def _iterated(self, state: State, start: int, stop: int) -> tuple[State, Info]:
-        """Iterations start..stop-1 on all devices, where the states then stay; diagnostics here."""
+        """Iterations start..stop-1 on all devices, where the states stay; diagnostics in numpy."""
         rows = state, self.question[1]
         state, info = self.launch(rows, start, stop, compiles=start == stop == 0)
         return state, on_host(info, self.mesh)

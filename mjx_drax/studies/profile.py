@@ -4,8 +4,9 @@
 
 For the flow and for the polish of each task, or with `--of plan` for plans of model predictive
 control: the time of an iteration or a plan, how many kernels it starts, the time in which one of
-them runs, and the kernels that take longest. Taken from JAX's profiler, in the last of three solves
-of N iterations each, or of three times N plans.
+them runs, the kernels that take longest, and between which the GPU waits longest, because the host
+decides something or starts the next. Taken from JAX's profiler, in the last of three solves of N
+iterations each, or of three times N plans. The profiler makes waits longer than they are.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
+import math
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -60,6 +62,18 @@ def busy(events: list[dict[str, Any]]) -> float:
     return total
 
 
+def waits(events: list[dict[str, Any]]) -> dict[str, list[float]]:
+    """Times [us] in which nothing runs, by the kernels before and after."""
+    found: dict[str, list[float]] = defaultdict(list)
+    end, last = math.inf, ""
+    for event in sorted(events, key=lambda e: e["ts"]):
+        if event["ts"] > end:
+            found[f"{last[:40]} to {event['name'][:40]}"].append(event["ts"] - end)
+        if event["ts"] + event["dur"] > end or math.isinf(end):
+            end, last = event["ts"] + event["dur"], event["name"]
+    return found
+
+
 def measured(run: Callable[[], tuple[int, float]], what: str, rows: int) -> None:
     """Run three times, and print the table of the third run.
 
@@ -78,13 +92,15 @@ def measured(run: Callable[[], tuple[int, float]], what: str, rows: int) -> None
         events = kernels(Path(folder))
     print(
         f"{count} {what} of {1e3 * seconds / count:.3f} ms: {len(events) / count:.0f} kernels, "
-        f"busy for {busy(events) / count / 1e3:.3f} ms\n\n| kernel | times | ms |\n|---|---|---|"
+        f"busy for {busy(events) / count / 1e3:.3f} ms"
     )
     sums: dict[str, list[float]] = defaultdict(list)
     for event in events:
         sums[event["name"]].append(event["dur"])
-    for name, times in sorted(sums.items(), key=lambda item: -sum(item[1]))[:rows]:
-        print(f"| {name[:60]} | {len(times) / count:.1f} | {sum(times) / count / 1e3:.4f} |")
+    for kind, found in (("kernel", sums), ("wait", waits(events))):
+        print(f"\n| {kind} | times | ms |\n|---|---|---|")
+        for name, times in sorted(found.items(), key=lambda item: -sum(item[1]))[:rows]:
+            print(f"| {name[:90]} | {len(times) / count:.1f} | {sum(times) / count / 1e3:.4f} |")
     print(flush=True)
 
 
