@@ -541,8 +541,8 @@ def _rows(state: State, which: ArrayLike) -> State:
 def _planner(structure: Any, explorers: int) -> compiled:
     """The program that plans with settings of this structure (flow, heated flow, polish, problem).
 
-    A call gives their leaves. A problem has more than a hundred, and to flatten it, and compare its
-    structure, takes the host longer than a GPU needs for a plan.
+    A call gives their leaves, so that no plan waits while settings and problem are flattened and
+    their structure is compared.
     """
 
     def plan(leaves: list[Any], carried: Carried, now: Now) -> tuple[Carried, Plan]:

@@ -6,11 +6,11 @@ After a step s = (dx_k, du_k), with the stage's Lagrangian l + lambda'f + nu'g a
 
     y = grad_k(z + s) - grad_k(z),    r = y - (H_k + B_k) s,    B_k <- B_k + r r' / (r's)
 
-(the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984), or, where that explodes,
-B_k changes by least (`least_change`). It needs no derivatives beyond those that Gauss-Newton has
-anyway, so programs compile no longer for it. Far from an optimum what stages have learned is wrong
-one step later, so it is used near one only. Where a chain stays close to one for long and f is
-smooth, B_k is measured now and then (`curvature`), and learns on.
+(the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984); where that explodes, B_k
+changes as little as it can (`symmetric_update`). It needs no derivatives beyond Gauss-Newton's, so
+programs compile no longer for it. Far from an optimum what stages have learned is wrong one step
+later, so it is used near one only. Where a chain stays close to one for long and f is smooth, B_k
+is measured now and then (`curvature`), and learns on.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Secant:
     ) -> Secant:
         """What is known at new knots; B stays where not `learns`.
 
-        `moves` (n,) is how far coordinates move; see `least_change`.
+        `moves` (n,) is how far coordinates move; see `symmetric_update`.
         """
         dynamics, cost, stage, _ = derivatives
         J = jnp.concatenate([jnp.concatenate([dynamics.A, dynamics.B], axis=2), stage], axis=1)
@@ -90,7 +90,7 @@ class Secant:
         noise = NOISE * jnp.finfo(g.dtype).eps * terms
         r = y - jnp.einsum("kij,kj->ki", blocks(cost) + self.B, s)
         r = jnp.where((jnp.abs(r) > noise).any(axis=1, keepdims=True), r, 0.0)
-        learned = self.B + jax.vmap(least_change, (0, 0, None))(r, s, moves)
+        learned = self.B + jax.vmap(symmetric_update, (0, 0, None))(r, s, moves)
         B = jnp.where(learns, learned, self.B)
         return Secant(B, J, g, x, knots.u, self.close)
 
@@ -107,11 +107,14 @@ def with_curvature(cost: QuadraticCost, B: Array) -> QuadraticCost:
     )
 
 
-def least_change(r: Array, s: Array, moves: Array) -> Array:
-    """A symmetric matrix D (n, n) with D s = r: that of rank one, or else the least one.
+def symmetric_update(r: Array, s: Array, moves: Array) -> Array:
+    """A symmetric matrix D (n, n) with D s = r, for r and s (n,).
 
-    Where r and s are nearly orthogonal, r r' / (r's) explodes. The least one is Powell's (1970), as
-    measured by how far coordinates move, `moves` (n,). It is no larger than 3 |r| / |s|.
+        r r' / (r's)                                    where r and s are not nearly orthogonal
+        (r s' + s r') / (s's) - (r's) s s' / (s's)^2    else: the smallest one (Powell 1970)
+
+    What is orthogonal or small depends on units, so coordinates are measured by how far they move,
+    `moves` (n,): above, r stands for r moves, s for s / moves, and D for D moves moves'.
     """
     r, s = r * moves, s / moves
     slope, length = r @ s, s @ s

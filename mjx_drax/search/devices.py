@@ -87,8 +87,7 @@ def split_over(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> C
         launch that `compiles`, devices take turns if the first one's program serves the others.
     """
     if mesh is None:
-        there = jax.device_put(whole)  # once: dozens of numbers take longer than an iteration
-        return lambda rows, *numbers, compiles=False: program(rows, *there, *numbers)
+        return lambda rows, *numbers, compiles=False: program(rows, *whole, *numbers)
     copies = {device: jax.device_put(whole, device) for device in mesh.local_devices}
 
     def launch(rows: Any, *numbers: Any, compiles: bool = False) -> Any:

@@ -422,7 +422,7 @@ class Search:
         """Which chains the polish still moves, (rows,)."""
         flags = state.polish.optimal, state.polish.stalled, state.alive
         optimal, stalled, alive = on_host(flags, self.mesh)
-        return np.asarray(alive & ~(optimal | stalled))
+        return np.asarray(replace(state.polish, optimal=optimal, stalled=stalled).active & alive)
 
     def _sound_costs(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
         """Costs of those problems' chains, from their floors, (len(indices), chains)."""
@@ -514,9 +514,10 @@ class Search:
             self.flow = flow
         else:
             self.flow = replace(flow, scale=scale_of(1.0, 1.0))
-        self.question = self.family.question(
-            self.flow, Scale(cost, noise), indices, self.chains, self.polish
-        )
+        scale = Scale(cost, noise)
+        shared, own = self.family.question(self.flow, scale, indices, self.chains, self.polish)
+        # once: to send its dozens of numbers with every launch takes longer than an iteration
+        self.question = jax.device_put(shared), own
         program = partial(iterate, tail=settings.after > 0)
         self.launch = split_over(program, self.mesh, self.question[0])
 

@@ -12,7 +12,7 @@ from mjx_drax import LogBarrier, Trajectory, from_function
 from mjx_drax.method.model import Multipliers, expand
 from mjx_drax.method.schedules import Weights
 from mjx_drax.polish.curvature import measured_hessian, with_exact_hessian
-from mjx_drax.polish.secant import Secant, least_change, with_curvature
+from mjx_drax.polish.secant import Secant, symmetric_update, with_curvature
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.trajectory import Stagewise
 
@@ -202,8 +202,8 @@ def test_what_is_learned_has_no_units():
         r = rng.normal(size=N)
         if i % 2:  # orthogonal to the step
             r -= r @ s / (s @ s) * s
-        D = least_change(jnp.asarray(r), jnp.asarray(s), MOVES)
+        D = symmetric_update(jnp.asarray(r), jnp.asarray(s), MOVES)
         np.testing.assert_allclose(D @ s, r, atol=1e-9)
         np.testing.assert_allclose(D, D.T)
-        other = least_change(r / units, s * units, units)
+        other = symmetric_update(r / units, s * units, units)
         np.testing.assert_allclose(other * jnp.outer(units, units), D, rtol=1e-9, atol=1e-12)
