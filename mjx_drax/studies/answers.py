@@ -3,10 +3,10 @@
     python -m mjx_drax.studies.answers [TASK[:CHAINS] ...] [--seeds N]
 
 A row for each task and seed: the share of chains whose replay with feedback succeeds; the best and
-the median cost of those; the share of all chains within 1 % of the best, and the share that has
-converged, with a residual below the tolerance; the share that is certified, as a replay with or
-without feedback succeeds; iterations; and seconds to solve and to compile. Of each task the first
-row's solve time has work that is done once in a process.
+the median cost of their better replays; the share of all chains within 1 % of the best, and the
+share that has converged, with a residual below the tolerance; the share that is certified, as a
+replay with or without feedback succeeds; iterations; and seconds to solve and to compile. Of each
+task the first row's solve time has work that is done once in a process.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ HEADER = (
 def line(solution: Solution) -> str:
     """The row of a solve, in Markdown."""
     good = np.asarray(solution.success)
-    costs = solution.cost[good]
-    best, median = solution.cost[solution.best_chain], np.median(costs) if good.any() else np.inf
+    costs = solution.replay_cost[good]
+    best = solution.replay_cost[solution.best_chain]
+    median = np.median(costs) if good.any() else np.inf
     close = (costs <= 1.01 * best).sum() / solution.chains
     converged = solution.residual < solution.tolerance
     return (
