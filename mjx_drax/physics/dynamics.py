@@ -333,7 +333,7 @@ class MjxDynamics(Dynamics):
         if self.nx == self.ndx:
             return np.asarray(x - y)
         rows = (a.reshape(-1, self.nx) for a in np.broadcast_arrays(x, y))
-        off = differences(self.mj_model, *rows)
+        off = differences(self.joints, *rows)
         return off.reshape(*np.broadcast_shapes(x.shape, y.shape)[:-1], self.ndx)
 
     def host_integrate(self, x: np.ndarray, dx: np.ndarray) -> np.ndarray:

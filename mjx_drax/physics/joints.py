@@ -45,7 +45,7 @@ class Joints:
         ]
         return cls(int(model.nq), int(model.nv), tuple(sorted(quaternions)))
 
-    def _parts(self) -> list[tuple[slice, slice, bool]]:
+    def parts(self) -> list[tuple[slice, slice, bool]]:
         """Slices of qpos and of its tangent, and whether they are those of a quaternion."""
         parts, q, v = [], 0, 0
         for at_q, at_v in self.quaternions:
@@ -65,7 +65,7 @@ class Joints:
             quaternion.normalized(quaternion.multiply(x[q], quaternion.exp(dx[v])))
             if turning
             else x[q] + dx[v]
-            for q, v, turning in self._parts()
+            for q, v, turning in self.parts()
         ]
         return jnp.concatenate([*parts, x[self.nq :] + dx[self.nv :]])
 
@@ -75,7 +75,7 @@ class Joints:
             return x - y
         parts = [
             quaternion.between(y[q], x[q]) if turning else x[q] - y[q]
-            for q, _, turning in self._parts()
+            for q, _, turning in self.parts()
         ]
         return jnp.concatenate([*parts, x[self.nq :] - y[self.nq :]])
 
@@ -94,7 +94,7 @@ class Joints:
             return numbers
         parts = [
             jnp.zeros((*numbers.shape[:-1], 3), numbers.dtype) if turning else numbers[..., q]
-            for q, _, turning in self._parts()
+            for q, _, turning in self.parts()
         ]
         return jnp.concatenate([*parts, numbers[..., self.nq :]], axis=-1)
 

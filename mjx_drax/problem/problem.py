@@ -386,7 +386,8 @@ class Problem:
         free, gains = np.array(np.inf), np.zeros((len(given), 1, dynamics.nu, dynamics.ndx))
         with self.arithmetic():
             which = np.tile(np.arange(self.horizon), len(given) // self.horizon)
-            knots = jax.tree.map(lambda a: a[which, None], self.knots.at(slice(-1)))
+            # In numpy, as JAX would compile a program for every number of rows
+            knots = jax.tree.map(lambda a: np.asarray(a)[which, None], self.knots.at(slice(-1)))
             ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
         off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
         return np.nan_to_num(off, nan=np.inf).reshape(*u.shape[:-1], dynamics.ndx)

@@ -25,12 +25,20 @@ def replay(
     limits: tuple[np.ndarray, np.ndarray],
     knots: Any,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`Dynamics.replay`, by f."""
+    """`Dynamics.replay`, by f.
+
+    Rows are repeated up to a power of two, so that few programs serve all numbers of them.
+    """
+    count = len(plan)
+    rows = np.arange(1 << (count - 1).bit_length()) % count
+    plan, u, gains = plan[rows], u[rows], gains[rows]
+    if knots.time.ndim == 2:
+        knots = jax.tree.map(lambda a: np.asarray(a)[rows], knots)
     with jax.enable_x64(True):
         step, difference, own = _in_float64(dynamics, "step", "difference")
         given = jax.tree.map(in_double, (plan, u, gains, limits, knots))
         ran = _replay(step, difference, own, *given)
-        return np.asarray(ran[0]), np.asarray(ran[1])
+        return np.asarray(ran[0])[:count], np.asarray(ran[1])[:count]
 
 
 def replay_by(

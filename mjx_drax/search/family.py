@@ -266,7 +266,7 @@ class Family:
 
         A linear model of contacts holds for small changes only, and gains that trust it can make
         controls chatter between their bounds. So where f has kinks and a replay leaves its plan,
-        smaller ones are tried, and the nearest replay is taken.
+        smaller ones are tried, and the first replay that stays is taken, or else the nearest.
         """
         difference = self.at(0).dynamics.host_difference
 
@@ -282,15 +282,15 @@ class Family:
 
         way = largest(plan, np.broadcast_to(plan[:, :1], plan.shape))
         best = Tracked(*map(np.array, run(np.arange(len(u)), gains)))
-        less = LESS_FEEDBACK if self.kinked and gains.any() else ()
-        for share in less:
-            rows = np.flatnonzero(best.left)
-            if not len(rows):
-                break
-            found = run(rows, share * gains[rows])
-            nearer = found.off < best.off[rows]
-            for whole, part in zip(best, found, strict=True):
-                whole[rows[nearer]] = part[nearer]
+        rows = np.flatnonzero(best.left)
+        if self.kinked and gains.any() and len(rows):
+            # Side by side: a replay takes little longer with more rows
+            less = np.concatenate([share * gains[rows] for share in LESS_FEEDBACK])
+            found = run(np.tile(rows, len(LESS_FEEDBACK)), less)
+            for part in zip(*(np.split(a, len(LESS_FEEDBACK)) for a in found), strict=True):
+                nearer = best.left[rows] & (part[-1] < best.off[rows])
+                for whole, of_share in zip(best, part, strict=True):
+                    whole[rows[nearer]] = of_share[nearer]
         return best
 
     def reached(self, states: np.ndarray) -> np.ndarray:

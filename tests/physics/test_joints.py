@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_drax.physics import quaternion
+from mjx_drax.physics.c_engine.states import difference, differences
 from mjx_drax.physics.joints import Joints
 
 MODEL = mujoco.MjModel.from_xml_string("""
@@ -51,6 +52,14 @@ def test_integration_and_difference_are_mujocos(turn):
     mujoco.mj_differentiatePos(MODEL, off, 1.0, x[:NQ], qpos)
     np.testing.assert_allclose(JOINTS.difference(y, x)[:NV], off, atol=1e-10)
     np.testing.assert_allclose(JOINTS.difference(y, x), dx, atol=1e-10)
+
+
+def test_differences_of_many_states_are_mujocos():
+    pairs = [drawn(seed) for seed in range(20)]
+    x, y = np.array([x for x, _ in pairs]), np.array([x for x, _ in reversed(pairs)])
+    x[0], x[1, :NQ] = y[0], -y[1, :NQ]  # at rest, and with -q for q, the same rotations
+    one_by_one = [difference(MODEL, *pair) for pair in zip(x, y, strict=True)]
+    np.testing.assert_allclose(differences(JOINTS, x, y), one_by_one, atol=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -16,6 +16,7 @@ from mjx_drax import (
     from_program,
     minimize,
     solve,
+    tasks,
 )
 
 
@@ -126,3 +127,20 @@ def test_float64_keeps_no_rounding_of_functions_that_ran_in_float32():
     np.testing.assert_allclose(values.constraints.stage, 2 / 3, rtol=1e-15)
     np.testing.assert_allclose(values.constraints.terminal, 2 / 3, rtol=1e-15)
     assert (exact.name, exact.goal, exact.guess) == (problem.name, problem.goal, problem.guess)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "pendulum_swingup"])  # a function, and MJCF
+def test_few_programs_replay_all_numbers_of_rows(name, caplog):
+    problem = tasks.load(name).make()
+    K, d = problem.horizon, problem.dynamics
+
+    def run(rows):
+        plan, u = np.zeros((rows, K + 1, d.nx)), np.zeros((rows, K, d.nu))
+        states, _ = problem.replay(plan, u, np.zeros((rows, K, d.nu, d.ndx)))
+        assert states.shape == plan.shape
+        np.testing.assert_allclose(problem.engine_defects(states, u), 0.0, atol=1e-12)
+
+    run(4)
+    with jax.log_compiles():
+        run(3)
+    assert not [record for record in caplog.records if "XLA compilation" in record.getMessage()]

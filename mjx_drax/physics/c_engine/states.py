@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from mjx_drax.physics.contacts.pairs import Contacts, Pair, left_out
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.joints import Joints
 
 Floats = npt.NDArray[np.floating]
 
@@ -65,18 +66,40 @@ def moved(model: mujoco.MjModel, qpos: Floats, dq: Floats, by: float = 1.0) -> F
     return out
 
 
-def differences(model: mujoco.MjModel, x: Floats, y: Floats) -> Floats:
-    """x - y in the tangent space at y, (n, ndx), for states (n, nx)."""
-    nq, nv = model.nq, model.nv
-    off = np.concatenate([np.empty((len(x), nv)), x[:, nq:] - y[:, nq:]], axis=1)
-    for row, one, other in zip(off, y, x, strict=True):
-        mujoco.mj_differentiatePos(model, row[:nv], 1.0, one[:nq], other[:nq])
-    return off
+def differences(joints: Joints, x: Floats, y: Floats) -> Floats:
+    """x - y in the tangent space at y, (n, ndx), for states (n, nx).
+
+    As `mj_differentiatePos` has it, which takes one state at a time.
+    """
+    parts = [
+        _rotations(y[:, q], x[:, q]) if turning else x[:, q] - y[:, q]
+        for q, _, turning in joints.parts()
+    ]
+    return np.concatenate([*parts, x[:, joints.nq :] - y[:, joints.nq :]], axis=1)
+
+
+def _rotations(p: Floats, q: Floats) -> Floats:
+    """The rotation vectors (n, 3) [rad], of length up to pi, that lead from p to q (n, 4)."""
+    turn = np.einsum("ijk,nj,nk->ni", _FROM_TO, p, q)
+    v = turn[:, 1:]
+    sine = np.sqrt(np.einsum("ni,ni->n", v, v))
+    angle = 2.0 * np.arctan2(sine, turn[:, 0])
+    angle -= 2.0 * np.pi * (angle > np.pi)
+    return np.asarray(v * (angle / np.maximum(sine, np.finfo(float).tiny))[:, None])
+
+
+_FROM_TO = np.zeros((4, 4, 4))
+"""Entries of p^-1 q, for quaternions p and q, are sums of _FROM_TO_ijk p_j q_k."""
+_FROM_TO[0] = np.eye(4)
+for _i, _j, _k in ((1, 2, 3), (2, 3, 1), (3, 1, 2)):
+    _FROM_TO[_i, 0, _i] = _FROM_TO[_i, _k, _j] = 1.0
+    _FROM_TO[_i, _i, 0] = _FROM_TO[_i, _j, _k] = -1.0
 
 
 def difference(model: mujoco.MjModel, x: Floats, y: Floats) -> Floats:
     """The same for one state (nx,), (ndx,)."""
-    return differences(model, x[None], y[None])[0]
+    dq = between(model, y[: model.nq], x[: model.nq])
+    return np.concatenate([dq, x[model.nq :] - y[model.nq :]])
 
 
 def integrate(model: mujoco.MjModel, x: Floats, dx: Floats) -> Floats:

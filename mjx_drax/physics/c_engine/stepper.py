@@ -44,7 +44,7 @@ class Stepper:
         self._now, self._sound = np.tile(self._start, (chains, 1)), np.ones(chains, bool)
         self._now[:, self._x] = x
         self._steps = np.empty((chains, substeps, len(self._start)))
-        self._elapsed = np.zeros(chains)
+        self._timesteps, self._elapsed = np.full(chains, model.opt.timestep), np.zeros(chains)
         self._open = ExitStack()
 
     def __enter__(self) -> Self:
@@ -64,7 +64,7 @@ class Stepper:
             self._models, self._own = [copy(model) for model in self._models], True
         for i, model in enumerate(self._models):
             if timesteps is not None:
-                model.opt.timestep = timesteps[i]
+                model.opt.timestep = self._timesteps[i] = timesteps[i]
             for name, values in numbers.items():
                 getattr(model, name)[...] = values[i].reshape(getattr(model, name).shape)
 
@@ -85,9 +85,8 @@ class Stepper:
             skip_checks=True,
         )
         self._now = now = self._steps[:, -1].copy()
-        timesteps = np.array([model.opt.timestep for model in self._models])
-        self._elapsed += self.substeps * timesteps
+        self._elapsed += self.substeps * self._timesteps
         sound &= (np.abs(now) < mujoco.mjMAXVAL).all(axis=1)
         # The engine resets a state that diverges, and its time: it falls behind
-        sound &= now[:, 0] > self._elapsed - 0.5 * timesteps
+        sound &= now[:, 0] > self._elapsed - 0.5 * self._timesteps
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
