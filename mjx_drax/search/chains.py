@@ -81,7 +81,7 @@ class Stage:
         kept: the best so far of all chains of all problems, (N * chains,); None before any.
         now: where the chunk's chains are, (rows,).
         before: `now.sound_cost` when it was asked last whether to wait, (rows,).
-        damping: of each row between rollouts, (rows,).
+        damping: of each row between rollouts, (rows,); inf for rows that they cannot improve.
         step: how many of the attempt's iterations are done.
         ends: of a single problem, `sound_cost` of the places when the latest attempts without and
             with noise ended, (2, chains), and after how many iterations they did, `steps` (2,).

@@ -667,7 +667,7 @@ class Search:
             stage.rollouts == 0
             and not better.any()
             and now.feasible.all()
-            and not self._replayer.replayed(now, 1.0)[1].any()
+            and not self._replayer.missed(now).any()
         ):
             return True
         try:
@@ -687,15 +687,20 @@ class Search:
             self.stage = replace(stage, now=now, rollouts=count)
             return
         done, end = stage.done + iterations, self.flow.iterations + self.settings.after
-        state = replace(now.state, damping=jnp.asarray(damping, now.state.damping.dtype))
-        state, info = self._iterated(state, end - iterations, end)
+        # Chains that the largest damping has left as they were would come to the same again
+        rows, most = np.flatnonzero(np.isfinite(damping)), DAMPING_RANGE[1]
+        finite = jnp.asarray(np.minimum(damping, most), now.state.damping.dtype)
+        state, info = self._iterated(replace(now.state, damping=finite), end - iterations, end)
         missed = np.ones(len(everyone), bool)  # until it is shown
         found = self._whole(Chains(state, info, np.full(len(everyone), done), missed))
-        found, better = self._replayer.rolled_out_in_part(now, found, done)
-        now = best_of(now, found, everyone)
+        found, better = self._replayer.rolled_out_in_part(now, found, rows, done)
+        before, now = now, best_of(now, found, everyone)
+        of_both = (np.stack([a.cost, a.info.max_defect]) for a in (before, now))
+        same = np.equal(*of_both).all(axis=0)
         factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))
-        damping = np.clip(damping * factor, *DAMPING_RANGE)
-        if not better.any() and (damping == DAMPING_RANGE[1]).all():
+        settled = same & (better == 0.0) & (damping >= most)
+        damping = np.where(settled, np.inf, np.clip(damping * factor, *DAMPING_RANGE))
+        if not better.any() and (damping >= most).all():
             count = total  # more would change nothing
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
 

@@ -274,24 +274,20 @@ class Family:
             with np.errstate(invalid="ignore"):  # of states that are not finite
                 return np.nan_to_num(np.abs(difference(x, y)).max(axis=(1, 2)), nan=np.inf)
 
-        def run(rows: np.ndarray, gains: np.ndarray) -> Tracked:
-            states, controls = self.replay(of[rows], plan[rows], u[rows], gains)
-            with np.errstate(over="ignore"):  # where a plan stands still and its replay does not
-                off = largest(states, plan[rows]) / np.maximum(way[rows], np.finfo(float).tiny)
-            return Tracked(states, controls, gains, off)
-
+        # Side by side: a replay hardly takes longer with more rows
+        shares = (1.0, *LESS_FEEDBACK) if self.kinked and gains.any() else (1.0,)
+        plans = np.arange(len(u))
+        which = np.tile(plans, len(shares))
+        given = np.concatenate([share * gains for share in shares])
+        states, controls = self.replay(of[which], plan[which], u[which], given)
         way = largest(plan, np.broadcast_to(plan[:, :1], plan.shape))
-        best = Tracked(*map(np.array, run(np.arange(len(u)), gains)))
-        rows = np.flatnonzero(best.left)
-        if self.kinked and gains.any() and len(rows):
-            # Side by side: a replay takes little longer with more rows
-            less = np.concatenate([share * gains[rows] for share in LESS_FEEDBACK])
-            found = run(np.tile(rows, len(LESS_FEEDBACK)), less)
-            for part in zip(*(np.split(a, len(LESS_FEEDBACK)) for a in found), strict=True):
-                nearer = best.left[rows] & (part[-1] < best.off[rows])
-                for whole, of_share in zip(best, part, strict=True):
-                    whole[rows[nearer]] = of_share[nearer]
-        return best
+        with np.errstate(over="ignore"):  # where a plan stands still and its replay does not
+            off = largest(states, plan[which]) / np.maximum(way, np.finfo(float).tiny)[which]
+        by_share = off.reshape(len(shares), -1)
+        stays = by_share <= OFF_PLAN
+        share = np.where(stays.any(axis=0), stays.argmax(axis=0), by_share.argmin(axis=0))
+        taken = share * len(plans) + plans
+        return Tracked(states[taken], controls[taken], given[taken], off[taken])
 
     def reached(self, states: np.ndarray) -> np.ndarray:
         """Whether motions x_0..x_K, (n, K + 1, nx), end at the goal, which the problems share."""

@@ -44,58 +44,25 @@ class Replayer:
         """The problem of each row, (rows,)."""
         return np.repeat(self.indices, len(self.floor) // len(self.indices))
 
-    def replayed(self, chains: Chains, with_feedback: float) -> tuple[Tracked, np.ndarray]:
-        """Replays of chains, and which of them miss; see `_tracked`."""
-        knots, gains = chains.state.trajectory, with_feedback * np.asarray(chains.state.gains)
-        return self._tracked(slice(None), self._plans(knots), np.asarray(knots.u), gains)
-
-    def _tracked(
-        self, rows: np.ndarray | slice, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
-    ) -> tuple[Tracked, np.ndarray]:
-        """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
-        family = self.family
-        ran = family.tracked(self.of[rows], plan, u, gains)
-        return ran, ran.left if family.problem.goal is None else ~family.reached(ran.states)
+    def missed(self, chains: Chains) -> np.ndarray:
+        """Which chains miss when they are replayed with feedback, (rows,); see `_tracked`."""
+        return self._rolled_out(chains, 1.0)[1]
 
     def rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
         """The best of chains and of their rollouts."""
-        ran, missed = self.replayed(chains, with_feedback)
-        found = self._as_knots(chains, ran.states, ran.controls, missed, done)
-        if with_feedback:  # one replay that arrives, with feedback or without, is enough
-            missed = missed & chains.missed
-        return best_of(replace(chains, missed=missed), found, np.arange(len(missed)))
-
-    def _as_knots(
-        self,
-        chains: Chains,
-        states: np.ndarray,
-        controls: np.ndarray,
-        missed: np.ndarray,
-        done: int,
-    ) -> Chains:
-        """Chains whose knots are rollouts (rows, K + 1, nx) of them, some of which have missed."""
-        knots = chains.state.trajectory
-        x, u = (jnp.asarray(a, knots.x.dtype) for a in (states[:, 1:], controls))
-        rolled = Trajectory(x, u, start=knots.start)
-        state = restart_at(self.question[1], self.question[0], chains.state, rolled)
-        state, info = self.diagnosed(state)
-        own = np.zeros(len(x), bool)
-        if self.family.problem.goal is not None:
-            ran_to = replace(state.trajectory, slack=None)
-            own, info = missed, self._by_the_engine(info, ran_to, ~missed)
-        return Chains(state, info, np.full(len(x), done), own)
+        return self._better(chains, np.arange(len(self.floor)), with_feedback, done)
 
     def rolled_out_in_part(
-        self, now: Chains, whole: Chains, done: int
+        self, now: Chains, whole: Chains, rows: np.ndarray, done: int
     ) -> tuple[Chains, np.ndarray]:
         """What a round has made of chains `now`, rolled out; or a share of it, where all is worse.
 
-        Also the largest share that has brought an improvement, 0 for none, (rows,).
+        That of `rows`; of the others nothing. Also the largest share that has brought an
+        improvement, 0 for none, (all rows,).
         """
-        floor = self.floor
-        found, everyone = self.rolled_out(whole, 1.0, done), np.arange(len(now.missed))
-        better = np.where(improved(now, found, floor), 1.0, 0.0)
-        rest = np.flatnonzero(better == 0.0)
+        found = self._better(whole, rows, 1.0, done)
+        better = np.where(improved(now, found, self.floor), 1.0, 0.0)
+        rest = rows[better[rows] == 0.0]
         if not len(rest):
             return found, better
         # Shares are replayed side by side: a replay hardly takes longer with more rows
@@ -106,17 +73,60 @@ class Replayer:
         gains = np.tile(np.asarray(whole.state.gains)[rest], (count, 1, 1, 1))
         ran, missed = self._tracked(np.tile(rest, count), plan, u, gains)
         of_shares = (np.split(a, count) for a in (ran.states, ran.controls, missed))
-        for share, *of_share in zip(SHARES, *of_shares, strict=True):
-            replays = self._plans(ends[1]), np.array(ends[1].u), np.ones(len(better), bool)
-            for of_all, of_rest in zip(replays, of_share, strict=True):
-                of_all[rest] = of_rest
-            part = self._as_knots(whole, *replays, done)
-            # What was settled stays: answers must not depend on neighbours in a batch
-            info = jax.tree.map(partial(jnp.where, better == 1.0, jnp.inf), part.info)
-            part = replace(part, info=info)
-            better = np.where(improved(now, part, floor), np.maximum(better, share), better)
-            found = best_of(found, part, everyone)
+        for share, states, controls, late in zip(SHARES, *of_shares, strict=True):
+            part = self._as_knots(whole, rest, states, controls, late, done)
+            better = np.where(improved(now, part, self.floor), np.maximum(better, share), better)
+            found = best_of(found, part, np.arange(len(better)))
         return found, better
+
+    def _better(self, chains: Chains, rows: np.ndarray, with_feedback: float, done: int) -> Chains:
+        """The best of chains and of their rollouts, of `rows`; the others are infinitely bad."""
+        ran, missed = self._rolled_out(chains, with_feedback, rows)
+        found = self._as_knots(chains, rows, ran.states, ran.controls, missed, done)
+        late = np.ones(len(self.floor), bool)
+        # One replay that arrives, with feedback or without, is enough
+        late[rows] = missed & chains.missed[rows] if with_feedback else missed
+        return best_of(_only(replace(chains, missed=late), rows), found, np.arange(len(late)))
+
+    def _rolled_out(
+        self, chains: Chains, with_feedback: float, rows: np.ndarray | slice = slice(None)
+    ) -> tuple[Tracked, np.ndarray]:
+        """Replays of rows of chains, and which of them miss; see `_tracked`."""
+        knots, gains = chains.state.trajectory, with_feedback * np.asarray(chains.state.gains)
+        return self._tracked(rows, self._plans(knots)[rows], np.asarray(knots.u)[rows], gains[rows])
+
+    def _tracked(
+        self, rows: np.ndarray | slice, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
+    ) -> tuple[Tracked, np.ndarray]:
+        """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
+        family = self.family
+        ran = family.tracked(self.of[rows], plan, u, gains)
+        return ran, ran.left if family.problem.goal is None else ~family.reached(ran.states)
+
+    def _as_knots(
+        self,
+        chains: Chains,
+        rows: np.ndarray,
+        states: np.ndarray,
+        controls: np.ndarray,
+        missed: np.ndarray,
+        done: int,
+    ) -> Chains:
+        """Chains whose knots are rollouts (n, K + 1, nx) of `rows`, some of which have missed.
+
+        The others are infinitely bad: answers must not depend on neighbours in a batch.
+        """
+        knots = chains.state.trajectory
+        x, u, late = np.array(knots.x), np.array(knots.u), np.ones(len(self.floor), bool)
+        x[rows], u[rows], late[rows] = states[:, 1:], controls, missed
+        rolled = Trajectory(jnp.asarray(x), jnp.asarray(u), start=knots.start)
+        state = restart_at(self.question[1], self.question[0], chains.state, rolled)
+        state, info = self.diagnosed(state)
+        own = np.zeros(len(x), bool)
+        if self.family.problem.goal is not None:
+            ran_to = replace(state.trajectory, slack=None)
+            own, info = late, self._by_the_engine(info, ran_to, ~late)
+        return _only(Chains(state, info, np.full(len(x), done), own), rows)
 
     def _plans(self, knots: Trajectory) -> np.ndarray:
         """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""
@@ -139,3 +149,10 @@ class Replayer:
             off = problem.engine_defects(plan[rows], u[rows]) / np.asarray(problem.defect_scale)
             defect[rows] = np.maximum(off.max(axis=(1, 2)), broken[rows])
         return replace(info, max_defect=jnp.asarray(defect))
+
+
+def _only(chains: Chains, rows: np.ndarray) -> Chains:
+    """The chains; those of other rows with infinitely bad diagnostics."""
+    others = np.ones(len(chains.missed), bool)
+    others[rows] = False
+    return replace(chains, info=jax.tree.map(partial(jnp.where, others, jnp.inf), chains.info))

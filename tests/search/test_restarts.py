@@ -38,6 +38,7 @@ from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, begin, evaluate, iterate, partition, restart_at
+from mjx_drax.search.replayer import Replayer
 from mjx_drax.search.restarts import Rollouts, settled
 
 DT, K = 0.1, 20
@@ -341,6 +342,25 @@ def test_where_all_that_a_round_changes_is_worse_a_share_of_it_helps(balls, monk
     assert in_part.feasible.all()
     assert (in_part.cost < whole.cost).all()
     assert np.median(in_part.cost) < 0.6 * np.median(whole.cost)
+
+
+@pytest.mark.slow
+def test_chains_that_rounds_leave_as_they_are_are_not_replayed_again(balls, monkeypatch):
+    def answer(all_rows):
+        seen, in_part = [], Replayer.rolled_out_in_part
+
+        def watched(self, now, whole, rows, done):
+            seen.append(len(rows))
+            return in_part(self, now, whole, np.arange(8) if all_rows else rows, done)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Replayer, "rolled_out_in_part", watched)
+            return solve(balls[1], chains=8, solver=Restarts(attempts=1)), seen
+
+    (found, seen), (same, _) = answer(all_rows=False), answer(all_rows=True)
+    assert 0 < min(seen) < max(seen) == 8
+    np.testing.assert_array_equal(found.trajectories.u, same.trajectories.u)
+    np.testing.assert_array_equal(found.cost, same.cost)
 
 
 @register_dataclass
