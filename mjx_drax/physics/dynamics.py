@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -315,7 +315,12 @@ class MjxDynamics(Dynamics):
 
     def stepper(self, x: np.ndarray) -> Stepper:
         """The C engine with states (chains, nx) that advance together."""
-        return Stepper(self.mj_model, self.substeps, x)
+        return Stepper(self.mj_model, self.substeps, x, self._idle)
+
+    @cached_property
+    def _idle(self) -> list[mujoco.MjData]:
+        """Data for steppers; see `Stepper`."""
+        return []
 
     def configured(self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any]) -> None:
         """Give every chain of a stepper its time between knots [s] and its parameters."""

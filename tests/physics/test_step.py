@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import Autodiff, Smoothed, from_mjcf
+from mjx_drax import Autodiff, Smoothed, from_mjcf, tasks
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.model import linearize
 from mjx_drax.physics.agreement.checks import Samples, compare
@@ -333,3 +333,17 @@ def test_float64_has_the_c_engines_numbers_and_changed_ones():
     heavier = replace(problem.dynamics, model=model.replace(body_mass=1.5 * model.body_mass))
     masses = np.asarray(heavier.in_float64().model.body_mass)
     np.testing.assert_allclose(masses, 1.5 * problem.dynamics.mj_model.body_mass, rtol=1e-7)
+
+
+def test_replays_do_not_depend_on_those_before():
+    """They take turns with the same data of the C engine, even after a motion that diverged."""
+    d = tasks.load("hopper_jump").make().dynamics
+    rng = np.random.default_rng(0)
+    plan = np.tile(rng.normal(scale=0.1, size=d.nx), (40, 9, 1))
+    u, limits = rng.normal(size=(40, 8, d.nu)), (np.array(-np.inf), np.array(np.inf))
+    gains = np.zeros((40, 8, d.nu, d.ndx))
+    first = d.replay(plan, u, gains, limits)
+    lost, _ = d.replay(plan + 1e6, 1e8 * u, gains, limits)
+    assert np.isnan(lost).any()
+    for before, after in zip(first, d.replay(plan, u, gains, limits), strict=True):
+        np.testing.assert_array_equal(before, after)

@@ -30,15 +30,25 @@ class Stepper:
     control alone. A state that diverges is NaN from then on.
     """
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, x: Floats) -> None:
-        """Start at states (chains, nx)."""
+    def __init__(
+        self, model: mujoco.MjModel, substeps: int, x: Floats, idle: list[mujoco.MjData]
+    ) -> None:
+        """Start at states (chains, nx).
+
+        Args:
+            model: what is stepped.
+            substeps: steps for each knot.
+            x: states (chains, nx).
+            idle: data of this model that nothing uses: a thread takes its own from here, and what
+                is missing is made, which takes a millisecond or two. All of it comes back.
+        """
         chains, nx = x.shape
         self.substeps, self._x = substeps, slice(1, 1 + nx)
         model = converged(model)
         self._models = [model] * chains
         self._own = False
         self._threads = min(-(-chains // CHAINS_PER_THREAD), os.cpu_count() or 1)
-        self._workers = [mujoco.MjData(model) for _ in range(self._threads)]
+        self._idle, self._workers = idle, [_taken(idle, model) for _ in range(self._threads)]
         self._start = np.empty(mujoco.mj_stateSize(model, _FULL_PHYSICS))
         mujoco.mj_getState(model, self._workers[0], self._start, _FULL_PHYSICS)
         self._now, self._sound = np.tile(self._start, (chains, 1)), np.ones(chains, bool)
@@ -57,6 +67,7 @@ class Stepper:
     def __exit__(self, *_: Any) -> None:
         """End them."""
         self._open.close()
+        self._idle += self._workers
 
     def configure(self, timesteps: Floats | None, numbers: Mapping[str, Floats]) -> None:
         """Give every chain a timestep [s] (chains,) and numbers of the model (chains, ...)."""
@@ -90,3 +101,13 @@ class Stepper:
         # The engine resets a state that diverges, and its time: it falls behind
         sound &= now[:, 0] > self._elapsed - 0.5 * self._timesteps
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
+
+
+def _taken(idle: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:
+    """Data of the model as it is when it is made, from the list if there is any."""
+    try:
+        data = idle.pop()  # which no other thread can take, too
+    except IndexError:
+        return mujoco.MjData(model)
+    mujoco.mj_resetData(model, data)
+    return data
