@@ -60,7 +60,7 @@ class Replayer:
         That of `rows`; of the others nothing. Also the largest share that has brought an
         improvement, 0 for none, (all rows,).
         """
-        found = self._better(whole, rows, 1.0, done)
+        found = self._better(whole, rows, 1.0, done, now)
         better = np.where(improved(now, found, self.floor), 1.0, 0.0)
         rest = rows[better[rows] == 0.0]
         if not len(rest):
@@ -74,15 +74,22 @@ class Replayer:
         ran, missed = self._tracked(np.tile(rest, count), plan, u, gains)
         of_shares = (np.split(a, count) for a in (ran.states, ran.controls, missed))
         for share, states, controls, late in zip(SHARES, *of_shares, strict=True):
-            part = self._as_knots(whole, rest, states, controls, late, done)
+            part = self._as_knots(whole, rest, states, controls, late, done, now)
             better = np.where(improved(now, part, self.floor), np.maximum(better, share), better)
             found = best_of(found, part, np.arange(len(better)))
         return found, better
 
-    def _better(self, chains: Chains, rows: np.ndarray, with_feedback: float, done: int) -> Chains:
+    def _better(
+        self,
+        chains: Chains,
+        rows: np.ndarray,
+        with_feedback: float,
+        done: int,
+        kept: Chains | None = None,
+    ) -> Chains:
         """The best of chains and of their rollouts, of `rows`; the others are infinitely bad."""
         ran, missed = self._rolled_out(chains, with_feedback, rows)
-        found = self._as_knots(chains, rows, ran.states, ran.controls, missed, done)
+        found = self._as_knots(chains, rows, ran.states, ran.controls, missed, done, kept)
         late = np.ones(len(self.floor), bool)
         # One replay that arrives, with feedback or without, is enough
         late[rows] = missed & chains.missed[rows] if with_feedback else missed
@@ -111,10 +118,12 @@ class Replayer:
         controls: np.ndarray,
         missed: np.ndarray,
         done: int,
+        kept: Chains | None,
     ) -> Chains:
         """Chains whose knots are rollouts (n, K + 1, nx) of `rows`, some of which have missed.
 
-        The others are infinitely bad: answers must not depend on neighbours in a batch.
+        The others are infinitely bad: answers must not depend on neighbours in a batch. What costs
+        no less than the sound chains `kept` is not judged by the engine, as it will not be taken.
         """
         knots = chains.state.trajectory
         x, u, late = np.array(knots.x), np.array(knots.u), np.ones(len(self.floor), bool)
@@ -125,21 +134,22 @@ class Replayer:
         own = np.zeros(len(x), bool)
         if self.family.problem.goal is not None:
             ran_to = replace(state.trajectory, slack=None)
-            own, info = late, self._by_the_engine(info, ran_to, ~late)
+            may_win = ~late if kept is None else ~late & ~(kept.sound_cost <= np.asarray(info.cost))
+            own, info = late, self._by_the_engine(info, ran_to, may_win)
         return _only(Chains(state, info, np.full(len(x), done), own), rows)
 
     def _plans(self, knots: Trajectory) -> np.ndarray:
         """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""
         return np.concatenate([self.family.starts(self.indices, knots)[:, None], knots.x], axis=1)
 
-    def _by_the_engine(self, info: Info, knots: Trajectory, won: np.ndarray) -> Info:
-        """Diagnostics of rollouts; max|h| of those that won (rows,) as the replaying engine has it.
+    def _by_the_engine(self, info: Info, knots: Trajectory, chosen: np.ndarray) -> Info:
+        """Diagnostics of rollouts; max|h| of `chosen` ones (rows,) as the replaying engine has it.
 
         Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
         that reaches the goal is a motion of the engine: it counts, if it keeps the constraints.
         """
         family, defect = self.family, np.array(info.max_defect)
-        which = np.flatnonzero(won & ~(defect < FEASIBLE))
+        which = np.flatnonzero(chosen & ~(defect < FEASIBLE))
         if not (family.kinked and len(which)):
             return info
         broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
