@@ -1,4 +1,4 @@
-"""States of a model in float64, by MuJoCo's own functions, and single steps of its C engine.
+"""States of a model in float64, in numpy as MuJoCo has them, and single steps of its C engine.
 
 x = [qpos (nq), qvel (nv), act (na)]; tangent vectors are [dq (nv), dv (nv), da (na)], and dq turns
 quaternions in their own frame. `joints` is the same arithmetic in JAX.
@@ -69,7 +69,8 @@ def moved(model: mujoco.MjModel, qpos: Floats, dq: Floats, by: float = 1.0) -> F
 def differences(joints: Joints, x: Floats, y: Floats) -> Floats:
     """x - y in the tangent space at y, (n, ndx), for states (n, nx).
 
-    As `mj_differentiatePos` has it, which takes one state at a time.
+    As `mj_differentiatePos` has it, which takes one state at a time, and `Joints.difference`, which
+    would be compiled for every number of states.
     """
     parts = [
         _rotations(y[:, q], x[:, q]) if turning else x[:, q] - y[:, q]
