@@ -26,7 +26,7 @@ from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.c_engine.states import differences, integrate, set_state
-from mjx_drax.physics.c_engine.stepper import Stepper
+from mjx_drax.physics.c_engine.stepper import Spare, Stepper
 from mjx_drax.physics.contacts.collision import left_out
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
 from mjx_drax.physics.contacts.pairs import left_out as pairs_left_out
@@ -315,12 +315,12 @@ class MjxDynamics(Dynamics):
 
     def stepper(self, x: np.ndarray) -> Stepper:
         """The C engine with states (chains, nx) that advance together."""
-        return Stepper(self.mj_model, self.substeps, x, self._idle)
+        return Stepper(self.mj_model, self.substeps, x, self._spare)
 
     @cached_property
-    def _idle(self) -> list[mujoco.MjData]:
-        """Data for steppers; see `Stepper`."""
-        return []
+    def _spare(self) -> Spare:
+        """What steppers leave for the next."""
+        return Spare()
 
     def configured(self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any]) -> None:
         """Give every chain of a stepper its time between knots [s] and its parameters."""

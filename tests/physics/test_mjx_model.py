@@ -410,7 +410,7 @@ PILE = """
 def test_contact_solvers_converge_and_options_that_stop_them_are_told():
     model = mujoco.MjModel.from_xml_string(PILE)
     x = np.concatenate([model.qpos0, np.full(model.nv, -0.3)])
-    with Stepper(model, 1, x[None], idle=[]) as stepper:
+    with Stepper(model, 1, x[None]) as stepper:
         replayed = stepper(np.ones((1, 1)))[0][0]
     exact = Engine(model).step(x, np.ones(1))
     assert np.abs(Engine(model, as_given=True).step(x, np.ones(1)) - exact).max() > 0.01

@@ -17,7 +17,7 @@ from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.model import linearize
 from mjx_drax.physics.agreement.checks import Samples, compare
 from mjx_drax.physics.c_engine.states import Engine, difference, moved
-from mjx_drax.physics.c_engine.stepper import Stepper
+from mjx_drax.physics.c_engine.stepper import Spare, Stepper
 from mjx_drax.problem.trajectory import Trajectory
 
 SWINGING = """
@@ -354,12 +354,12 @@ def test_what_actuators_remember_is_not_taken_from_a_replay_before():
     model = mujoco.MjModel.from_xml_string("""
     <mujoco><worldbody><body><joint name="j" type="slide"/><geom size="0.1"/></body></worldbody>
       <actuator><motor joint="j" delay="0.006" nsample="4"/></actuator></mujoco>""")
-    idle = []
+    spare = Spare()
 
     def ran(force):
-        with Stepper(model, 1, np.zeros((1, 2)), idle) as stepper:
+        with Stepper(model, 1, np.zeros((1, 2)), spare) as stepper:
             return [stepper(np.full((1, 1), force))[0] for _ in range(8)]
 
     first, _, again = ran(1.0), ran(-5.0), ran(1.0)
-    assert len(idle) == 1
+    assert len(spare.data) == 1
     np.testing.assert_array_equal(first, again)

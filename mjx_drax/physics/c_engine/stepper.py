@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from copy import copy
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -13,13 +16,35 @@ import numpy as np
 from mjx_drax.physics.c_engine.states import Floats, converged, quiet
 from mjx_drax.physics.engine import Rollout, mujoco
 
+WORTH_A_THREAD = 4e-4
+"""Work at a knot [s] that is worth a thread: threads wait for each other at every knot, for about so
+long. For 64 chains of a hopper on two cores, 64 threads took five times as long as one."""
+
 CHAINS_PER_THREAD = 8
-"""Chains that a thread replays. Threads wait for each other at every knot, which takes longer than
-a few steps do: for 64 chains of a hopper on two cores, 64 threads took five times as long as one.
-"""
+"""Chains that a thread replays before it is known how long a knot takes."""
 
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """What a step of the C engine starts from: time, state, and what actuators and plugins remember."""
+
+
+@dataclass
+class Spare:
+    """What steppers of one model and one number of substeps leave for the next.
+
+    Attributes:
+        data: data of the C engine that nothing uses; to make one takes a millisecond or two.
+        seconds: that a knot of one chain takes, the shortest seen.
+    """
+
+    data: list[mujoco.MjData] = field(default_factory=list)
+    seconds: float = math.inf
+
+    def threads(self, chains: int) -> int:
+        """How many threads replay so many chains."""
+        wanted = chains / CHAINS_PER_THREAD
+        if math.isfinite(self.seconds):
+            wanted = chains * self.seconds / WORTH_A_THREAD
+        return min(math.ceil(wanted), chains, os.cpu_count() or 1)
 
 
 class Stepper:
@@ -31,7 +56,7 @@ class Stepper:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, substeps: int, x: Floats, idle: list[mujoco.MjData]
+        self, model: mujoco.MjModel, substeps: int, x: Floats, spare: Spare | None = None
     ) -> None:
         """Start at states (chains, nx).
 
@@ -39,16 +64,16 @@ class Stepper:
             model: what is stepped.
             substeps: steps for each knot.
             x: states (chains, nx).
-            idle: data of this model that nothing uses: a thread takes its own from here, and what
-                is missing is made, which takes a millisecond or two. All of it comes back.
+            spare: of steppers before; this one's goes there, too.
         """
         chains, nx = x.shape
         self.substeps, self._x = substeps, slice(1, 1 + nx)
         model = converged(model)
         self._models = [model] * chains
         self._own = False
-        self._threads = min(-(-chains // CHAINS_PER_THREAD), os.cpu_count() or 1)
-        self._idle, self._workers = idle, [_taken(idle, model) for _ in range(self._threads)]
+        self._spare = spare = spare or Spare()
+        self._threads = spare.threads(chains)
+        self._workers = [_taken(spare.data, model) for _ in range(self._threads)]
         self._start = np.empty(mujoco.mj_stateSize(model, _FULL_PHYSICS))
         mujoco.mj_getState(model, self._workers[0], self._start, _FULL_PHYSICS)
         self._now, self._sound = np.tile(self._start, (chains, 1)), np.ones(chains, bool)
@@ -67,7 +92,7 @@ class Stepper:
     def __exit__(self, *_: Any) -> None:
         """End them."""
         self._open.close()
-        self._idle += self._workers
+        self._spare.data += self._workers
 
     def configure(self, timesteps: Floats | None, numbers: Mapping[str, Floats]) -> None:
         """Give every chain a timestep [s] (chains,) and numbers of the model (chains, ...)."""
@@ -85,6 +110,7 @@ class Stepper:
         sound &= (np.abs(u) < mujoco.mjMAXVAL).all(axis=1)
         now[~sound] = self._start  # a state that can be stepped; its result is not used
         control, applied = np.where(sound[:, None], u, 0.0), np.where(sound[:, None], u, np.nan)
+        began = time.perf_counter()
         self._engine.rollout(
             self._models,
             self._workers,
@@ -95,6 +121,8 @@ class Stepper:
             chunk_size=-(-len(u) // self._threads),
             skip_checks=True,
         )
+        took = (time.perf_counter() - began) * self._threads / len(u)
+        self._spare.seconds = min(self._spare.seconds, took)
         self._now = now = self._steps[:, -1].copy()
         self._elapsed += self.substeps * self._timesteps
         sound &= (np.abs(now) < mujoco.mjMAXVAL).all(axis=1)
@@ -103,10 +131,10 @@ class Stepper:
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
 
 
-def _taken(idle: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:
+def _taken(spare: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:
     """Data of the model as it is when it is made, from the list if there is any."""
     try:
-        data = idle.pop()  # which no other thread can take, too
+        data = spare.pop()  # which no other thread can take, too
     except IndexError:
         return mujoco.MjData(model)
     mujoco.mj_resetData(model, data)
