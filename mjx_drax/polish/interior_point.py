@@ -12,7 +12,7 @@ is in units of a user's: D, the penalties of constraints and the barrier's weigh
                 curvature is learned, short steps say that some is missing, and raise it too
     step        the largest of a ladder, up to the boundary, that lowers the merit function
                 c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977), or
-                its first two terms, while h stays within a funnel that narrows
+                its first two terms, while h stays within a funnel that narrows (`line_search`)
     barrier     rho falls when its problem is nearly solved (`_barrier`), and rises where the
                 boundary leaves only short steps
     end         the `residual`, and what the last model promised to gain, relative to the cost, are
@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -37,13 +36,13 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.kernels.first_success import first_success
-from mjx_drax.kernels.recursion import affine_recursion
 from mjx_drax.method.bounds import Sides
 from mjx_drax.method.gauss_newton import slack_step, stage_steps, start_of, with_constraints
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Model, Multipliers, QuadraticCost
 from mjx_drax.method.riccati import newton_with_start
 from mjx_drax.polish.curvature import measured_hessian, with_exact_hessian
+from mjx_drax.polish.line_search import Ray, line_search, worst
 from mjx_drax.polish.residual import (
     STILL,
     Residual,
@@ -59,8 +58,8 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
-ARMIJO, FUNNEL, NARROWER = 1e-4, 0.05, 0.7
-"""Share of what is promised that a step must bring; the first funnel, and the factor when used."""
+FUNNEL, NARROWER = 0.05, 0.7
+"""The first funnel, and the factor when it is used; see `line_search`."""
 
 DAMPED = 1e-2
 """First damping after a flow. Without it the first steps leave the basin that the flow found."""
@@ -68,9 +67,6 @@ DAMPED = 1e-2
 STATE_DAMPING = 1e-2
 """Damping of states beside that of controls: D is the largest along the motion, and often that of
 the end."""
-
-LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
-"""Sizes of steps that are tried at once, as shares of the way to the boundary."""
 
 LESS_DAMPING, MORE_DAMPING = 1 / 3, 8.0
 """Factors on the damping after a good step, and after a poor one."""
@@ -81,9 +77,6 @@ the chain stalls."""
 
 KEEPS_DAMPING, RAISES_DAMPING = 0.5, 0.25
 """Where curvature is learned: the longest steps that keep the damping, and that raise it."""
-
-INSIDE = 0.99
-"""Share of the way to their bounds that controls may be moved to bend a step."""
 
 TRIES = 3
 """Factorizations in one iteration: without learned curvature, then with more damping each time."""
@@ -395,9 +388,9 @@ def _moved(
     of_cost, of_defects = _promised(model, d, left, eta)
     promised = of_cost - rho * _logs(ends, moves, reach), of_defects
     rows = Multipliers(scales.x, Stagewise(*row_scales(derivatives, scales, model.trajectory)))
-    alpha, X, parts = _line_search(
-        problem, model, d, gains, reach, eta, rho, promised, rows, now.funnel
-    )
+    A, B = derivatives.dynamics.A, derivatives.dynamics.B
+    ray = Ray(problem, knots, d, reach, A + B @ gains, gains, eta, rho, promised, rows, now.funnel)
+    alpha, X, parts = line_search(ray, ok & needed)
     found = ok & (alpha > 0.0)
     alpha = jnp.where(found, alpha, 0.0)
     X = jax.tree.map(lambda a, b: jnp.where(found, a, b), X, knots)
@@ -412,7 +405,7 @@ def _moved(
         kept = jnp.where(alpha > RAISES_DAMPING * reach, damping, higher)
         lower = jnp.where(alpha > KEEPS_DAMPING * reach, lower, kept)
     after = jnp.where(found, lower, higher)
-    shortfall, present = _worst(left, rows), _worst(model.h, rows)
+    shortfall, present = worst(left, rows), worst(model.h, rows)
     loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
     most = 1e-2 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
     stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
@@ -624,108 +617,3 @@ def _logs(ends: Sides, moves: Trajectory, reach: Array) -> Array:
     back = jax.tree.map(jnp.negative, moves)
     sides = (jax.tree.map(growth, ends[0], moves), jax.tree.map(growth, ends[1], back))
     return sum(jax.tree.leaves(sides)) / reach
-
-
-def _line_search(
-    problem: Problem,
-    model: Model,
-    d: Trajectory,
-    gains: Array,
-    reach: Array,
-    eta: Multipliers,
-    rho: Array,
-    promised: tuple[Array, Array],
-    rows: Multipliers,
-    funnel: Array,
-) -> tuple[Array, Trajectory, Array]:
-    """The largest step of the ladder that lowers the merit function as promised, or 0.
-
-    h, relative to `rows`, may not more than double where it is above 1: a cost without a lower
-    bound would lead away from the constraints for ever. A step that lowers the cost as promised
-    may let h grow up to the `funnel`, which then narrows: the merit function alone allows but
-    short steps along curved constraints (Maratos 1978; a funnel: Gould and Toint 2010). So every
-    step is tried `_bent` along the dynamics too; of two of one size that of lower merit is taken.
-
-    Returns:
-        the size, the new knots, and whether the funnel was used.
-    """
-    knots = model.trajectory
-
-    sizes = jnp.append(jnp.asarray(LADDER, d.u.dtype) * reach, 0.0)
-    straight = jax.vmap(
-        lambda alpha: problem.displaced(knots, jax.tree.map(lambda d: alpha * d, d))
-    )(sizes)
-
-    def tried(new: Trajectory, first: Array) -> tuple[Trajectory, Any]:
-        merits = jax.vmap(lambda new: _merit(problem, new, eta, rho))(new)
-        bent = partial(_bent, problem, model, gains, new, merits[2].dynamics)
-        return jax.lax.cond(first, bent, lambda: new), (new, merits)
-
-    # where f is long, as with contacts, in a loop: so it compiles once
-    unroll = 1 if problem.dynamics.kinked else 2
-    both = jax.lax.scan(tried, straight, jnp.array([True, False]), unroll=unroll)[1]
-    candidates, (costs, penalties, h) = jax.tree.map(
-        lambda a: jnp.concatenate([a[1, :-1], a[0]]), both
-    )
-    ladder, sizes = sizes[:-1], jnp.append(sizes[:-1], sizes)
-    apart = jax.vmap(lambda h: _worst(h, rows))(h)
-    cheaper = jnp.sum(costs - costs[-1], axis=1)
-    change = cheaper + jnp.sum(penalties - penalties[-1], axis=1)
-    rounding = 10.0 * jnp.finfo(costs.dtype).eps * jnp.sum(jnp.abs(costs[-1]) + penalties[-1])
-    lowers = change <= ARMIJO * sizes * jnp.minimum(sum(promised), 0.0) + rounding
-    lowers &= jnp.isfinite(change) & (apart <= jnp.maximum(2.0 * apart[-1], 1.0))
-    falls = (promised[0] < 0.0) & (cheaper <= ARMIJO * sizes * promised[0]) & (apart <= funnel)
-    allowed = (lowers | falls).at[-1].set(True)
-    largest = jnp.max(jnp.where(allowed, sizes, 0.0))
-    change = change.at[: len(ladder)].add(rounding)  # to bend by rounding errors is no gain
-    best = jnp.argmin(jnp.where(allowed & (sizes == largest), change, jnp.inf))
-    chosen: Trajectory = jax.tree.map(lambda z: z[best], candidates)
-    return sizes[best], chosen, ~lowers[best] & (sizes[best] > 0.0)
-
-
-def _bent(
-    problem: Problem, model: Model, gains: Array, straight: Trajectory, defects: Array
-) -> Trajectory:
-    """Knots (n, K, ...) without most of their defects (n, K, ndx), states and controls changed.
-
-    One Newton step from the knots to the rollout of their controls with feedback K:
-
-        dx_{k+1} = (A_k + B_k K_k) dx_k + h_k,    du_k = K_k dx_k,    dx_0 = 0
-
-    A second-order correction, as Maratos' effect asks for, that costs no factorization.
-    """
-    assert model.derivatives is not None
-    A, B = model.derivatives.dynamics.A, model.derivatives.dynamics.B
-    dx = jnp.moveaxis(affine_recursion(A + B @ gains, jnp.moveaxis(defects, 0, -1)), -1, 0)
-    before = jnp.concatenate([jnp.zeros_like(dx[:, :1]), dx[:, :-1]], axis=1)
-    du = (gains @ before[..., None])[..., 0]
-    here, (lower, upper) = model.trajectory.u, slacks_of(problem, model.trajectory)
-    u = jnp.clip(straight.u + du, here - INSIDE * lower.u, here + INSIDE * upper.u)
-    x = jax.vmap(jax.vmap(problem.dynamics.integrate))(straight.x, dx)
-    return replace(straight, x=x, u=u)
-
-
-def _worst(h: Multipliers, rows: Multipliers) -> Array:
-    """The largest |h|, relative to the scales of its rows."""
-    tiny = jnp.finfo(rows.dynamics.dtype).tiny
-    shares = jax.tree.map(lambda h, s: (jnp.abs(h) / (s + tiny)).max(initial=0.0), h, rows)
-    return jnp.max(jnp.stack(jax.tree.leaves(shares)))
-
-
-def _merit(
-    problem: Problem, knots: Trajectory, eta: Multipliers, rho: Array
-) -> tuple[Array, Array, Multipliers]:
-    """c - rho sum log(slacks) and sum eta |h|, one term a stage, (K + 1,), and h."""
-    values = problem.values(knots)
-    r = problem.with_slack(values.constraints, knots.slack)
-    penalties = jnp.append(
-        jnp.sum(eta.dynamics * jnp.abs(values.defects), axis=-1)
-        + jnp.sum(eta.constraints.stage * jnp.abs(r.stage), axis=-1),
-        jnp.sum(eta.constraints.terminal * jnp.abs(r.terminal)),
-    )
-    costs = values.costs
-    for slack in jax.tree.leaves(slacks_of(problem, knots)):
-        logs = jnp.where(jnp.isinf(slack), 0.0, jnp.log(slack))
-        place = slice(None, -1) if logs.ndim > 1 else -1  # at stages, or at the end
-        costs = costs.at[place].add(-rho * jnp.sum(logs, axis=-1))
-    return costs, penalties, Multipliers(values.defects, r)

@@ -17,8 +17,8 @@ from mjx_drax.physics.c_engine.states import Floats, converged, quiet
 from mjx_drax.physics.engine import Rollout, mujoco
 
 WORTH_A_THREAD = 4e-4
-"""Work at a knot [s] that is worth a thread: threads wait for each other at every knot, for about so
-long. For 64 chains of a hopper on two cores, 64 threads took five times as long as one."""
+"""Work at a knot [s] that is worth a thread: threads wait for each other at every knot, for about
+so long. For 64 chains of a hopper on two cores, 64 threads took five times as long as one."""
 
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays before it is known how long a knot takes."""

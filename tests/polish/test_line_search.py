@@ -1,0 +1,84 @@
+"""Which step the polish takes along a direction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_drax import from_function
+from mjx_drax.method.model import Multipliers
+from mjx_drax.polish import line_search
+from mjx_drax.polish.line_search import LADDER, Ray
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
+
+K, DT, ROWS = 12, 0.1, 23
+
+
+def rays(seed=0):
+    """Directions of a curved problem, some of which help only when they are short, or never."""
+
+    def f(x, u):
+        return x + DT * jnp.array([x[1], u[0] - jnp.sin(3.0 * x[0])])
+
+    problem = from_function(
+        f, nu=1, dt=DT, horizon=K * DT, x_init=[0.0, 0.0], running_cost=lambda x, u: x @ x + u @ u
+    )
+    rng = np.random.default_rng(seed)
+    x, u = rng.normal(size=(ROWS, K, 2)), rng.normal(size=(ROWS, K, 1))
+    size = (
+        10.0 ** rng.uniform(-1.0, 2.0, (ROWS, 1, 1))
+        * np.where(rng.random(ROWS) < 0.2, -1, 1)[:, None, None]
+    )
+    away = Trajectory(jnp.asarray(-size * x), jnp.asarray(-size * u))
+    none = Stagewise(jnp.zeros((K, 0)), jnp.zeros(0))
+    gains = 0.1 * rng.normal(size=(ROWS, K, 1, 2))
+    rows = {
+        "knots": Trajectory(jnp.asarray(x), jnp.asarray(u)),
+        "d": away,
+        "reach": jnp.asarray(rng.uniform(0.5, 1.0, ROWS)),
+        "closed": jnp.asarray(0.3 * rng.normal(size=(ROWS, K, 2, 2))),
+        "gains": jnp.asarray(gains),
+        "eta": Multipliers(
+            jnp.asarray(rng.random((ROWS, K, 2))),
+            jax.tree.map(lambda a: jnp.zeros((ROWS, *a.shape)), none),
+        ),
+        "funnel": jnp.asarray(rng.choice([0.0, 5.0], ROWS)),
+    }
+    common = {
+        "problem": problem,
+        "rho": jnp.zeros(()),
+        "promised": (jnp.full((), -0.1), jnp.full((), -0.1)),
+        "rows": Multipliers(jnp.ones(2), none),
+    }
+    return rows, common
+
+
+def searched(way, rows, common, *more):
+    """What a way to search gives for all rows."""
+    return jax.jit(jax.vmap(lambda own, *more: way(Ray(**own, **common), *more)))(rows, *more)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_chains_that_share_their_work_take_the_steps_that_they_would_take_alone(seed):
+    rows, common = rays(seed)
+    needed = jnp.asarray(np.random.default_rng(seed).random(ROWS) < 0.8)
+    size, knots, through = searched(line_search._side_by_side, rows, common)
+    shared = searched(line_search._by_need, rows, common, needed)
+    steps = np.asarray(size / rows["reach"])
+    assert len(np.unique(steps.round(4))) >= 5  # 0, too
+    assert {0.0, *np.float32(LADDER).round(4)} >= set(steps.round(4).tolist())
+    np.testing.assert_allclose(shared[0], np.where(needed, size, 0.0), rtol=1e-6)
+    moved = np.asarray(needed & (size > 0.0))
+    np.testing.assert_array_equal(np.asarray(shared[2])[moved], np.asarray(through)[moved])
+    for a, b in zip(jax.tree.leaves(shared[1]), jax.tree.leaves(knots), strict=True):
+        np.testing.assert_allclose(np.asarray(a)[moved], np.asarray(b)[moved], rtol=1e-5, atol=1e-5)
+
+
+def test_one_chain_alone_takes_the_same_step():
+    rows, common = rays()
+    size, knots, _ = searched(line_search._side_by_side, rows, common)
+    for i in np.flatnonzero(np.asarray(size) > 0.0)[:4]:
+        ray = Ray(**jax.tree.map(lambda a, i=i: a[i], rows), **common)
+        alone = line_search._by_need(ray, jnp.ones((), bool))
+        np.testing.assert_allclose(alone[0], size[i], rtol=1e-6)
+        np.testing.assert_allclose(alone[1].x, knots.x[i], rtol=1e-5, atol=1e-5)
