@@ -3,9 +3,10 @@
     python -m mjx_drax.studies.iteration TASK[:CHAINS] ... [--horizon S] [--repeats N]
 
 A row for each task and number of chains, in milliseconds: f at all knots, Jacobians of f at all
-knots, one recursion with noise and gains, an iteration with noise, and one of the noise-free tail,
-whose line search evaluates f several times at each knot. Plans last as long as the task's, or S
-seconds. Times are medians of calls in one process; the last column is the time that all of these
+knots, one recursion with noise and gains, an iteration with noise, one of the noise-free tail, and
+one of the polish. Line searches evaluate f several times at each knot: that of the tail 5 times, that
+of the polish 14 times on GPUs, and on CPUs as often as it needs. Plans last as long as the task's,
+or S seconds. Times are medians of calls in one process; the last column is the time that all of these
 took to compile, in seconds. To compare two versions, run this file with
 PYTHONPATH set to either checkout.
 """
@@ -15,6 +16,8 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 import jax
 
@@ -23,9 +26,10 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.model import linearize
 from mjx_drax.method.riccati import newton
+from mjx_drax.polish.interior_point import Polish, begin_inside
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.initial import initial_knots
-from mjx_drax.search.iterate import start
+from mjx_drax.search.iterate import Question, iteration, start
 from mjx_drax.studies.recursion import batch, timed
 
 TASKS = ("quadruped_step:32", "humanoid_stand:32", "quadruped_step:1", "humanoid_stand:1")
@@ -37,6 +41,9 @@ def times(problem: Problem, chains: int, repeats: int) -> tuple[list[float], flo
     K, key = problem.horizon, jax.random.key(0)
     knots = initial_knots(problem, chains, None, key)
     states = start(flow, problem, knots, key)
+    polished = Question(replace(flow, iterations=0), problem, polish=Polish())
+    barrier = jax.numpy.ones(())  # of as much weight as costs of about 1
+    inside = jax.vmap(lambda state: begin_inside(problem, state, barrier))(states)
     recursion = batch(chains, K, problem.dynamics.ndx, problem.dynamics.nu)
     keys = jax.random.split(key, (chains, K))
     parts = [
@@ -45,6 +52,7 @@ def times(problem: Problem, chains: int, repeats: int) -> tuple[list[float], flo
         (newton, recursion),
         (lambda s: flow.step(problem, s, 0, tail=False)[0], (states,)),
         (lambda s: flow.step(problem, s, flow.iterations, noise=False)[0], (states,)),
+        (partial(iteration, 0, polished), (inside,)),
     ]
     seconds, compiling = [], 0.0
     for part, arguments in parts:
@@ -63,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args(arguments)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, milliseconds\n")
-    print("| task | K | chains | f | Jacobians | recursion | noise | tail | compile [s] |")
-    print("|---" * 9 + "|")
+    print("| task | K | chains | f | Jacobians | recursion | noise | tail | polish | compile [s] |")
+    print("|---" * 10 + "|")
     own = {} if options.horizon is None else {"horizon": options.horizon}
     for word in options.tasks:
         name, _, chains = word.partition(":")

@@ -11,5 +11,5 @@ def test_a_row_has_a_positive_time_for_every_part(capsys):
     row = capsys.readouterr().out.splitlines()[-1].strip("|").split("|")
     assert row[0].strip() == "cartpole_swingup"
     assert row[1].strip() == "50"
-    assert len(row) == 9
-    assert all(float(entry) > 0 for entry in row[3:8])
+    assert len(row) == 10
+    assert all(float(entry) > 0 for entry in row[3:9])
