@@ -15,9 +15,9 @@ is in units of a user's: D, the penalties of constraints and the barrier's weigh
                 its first two terms, while h stays within a funnel that narrows (`line_search`)
     barrier     rho falls when its problem is nearly solved (`_barrier`), and rises where the
                 boundary leaves only short steps
-    end         the `residual`, and what the last model promised to gain, relative to the cost, are
-                below the tolerance, and the chain stands still; or no step is found however large
-                the damping, and it has stalled
+    end         the `residual`, and what the model promises to gain, or the last one did, relative
+                to the cost, are below the tolerance, and the chain stands still; or no step is
+                found however large the damping, and it has stalled
 
 After J. Nocedal and S. Wright, Numerical Optimization, 2006, chapter 19, and A. Waechter and L.
 Biegler, On the implementation of an interior-point filter line-search algorithm, 2006.
@@ -390,7 +390,9 @@ def _moved(
     rows = Multipliers(scales.x, Stagewise(*row_scales(derivatives, scales, model.trajectory)))
     A, B = derivatives.dynamics.A, derivatives.dynamics.B
     ray = Ray(problem, knots, d, reach, A + B @ gains, gains, eta, rho, promised, rows, now.funnel)
-    alpha, X, parts = line_search(ray, ok & needed)
+    gain = jnp.abs(promised[0]) / scales.cost
+    ends = ok & (jnp.maximum(residual.total, gain) < polish.tolerance)
+    alpha, X, parts = line_search(ray, ok & needed & ~ends)
     found = ok & (alpha > 0.0)
     alpha = jnp.where(found, alpha, 0.0)
     X = jax.tree.map(lambda a, b: jnp.where(found, a, b), X, knots)
@@ -410,25 +412,28 @@ def _moved(
     most = 1e-2 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
     stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
     blocked = jnp.minimum(RAISE * rho, 0.1 * scales.terms)
-    now = replace(
+    arrived = replace(now, optimal=ends, residual=jnp.maximum(residual.total, gain))
+    moved = replace(
         now,
         barrier=jnp.where(reach < BLOCKED, jnp.maximum(rho, blocked), rho),
         damping=after,
         stiffness=stiffness,
         penalties=jax.tree.map(lambda a, b: jnp.where(ok, a, b), eta, now.penalties),
         size=alpha,
-        promise=jnp.where(ok, jnp.abs(promised[0]) / scales.cost, now.promise),
+        promise=jnp.where(ok, gain, now.promise),
         funnel=jnp.where(parts, NARROWER * now.funnel, now.funnel),
         iterations=now.iterations + 1,
         stalled=after > MOST_DAMPING,
     )
-    return replace(
+    new = replace(
         state,
         trajectory=X,
         multipliers=replace(lambda_, bounds=v),
         gains=jnp.where(ok, gains, state.gains),
-        polish=now,
+        polish=moved,
     )
+    kept = replace(state, polish=arrived)
+    return jax.tree.map(lambda a, b: jnp.where(ends, a, b), kept, new)
 
 
 def _barrier(

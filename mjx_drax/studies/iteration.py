@@ -4,11 +4,11 @@
 
 A row for each task and number of chains, in milliseconds: f at all knots, Jacobians of f at all
 knots, one recursion with noise and gains, an iteration with noise, one of the noise-free tail, and
-one of the polish. Line searches evaluate f several times at each knot: that of the tail 5 times, that
-of the polish 14 times on GPUs, and on CPUs as often as it needs. Plans last as long as the task's,
-or S seconds. Times are medians of calls in one process; the last column is the time that all of these
-took to compile, in seconds. To compare two versions, run this file with
-PYTHONPATH set to either checkout.
+one of the polish. Line searches evaluate f at each knot: that of the tail 5 times, that of the
+polish 14 times on GPUs, and on CPUs as often as it needs. Plans last as long as the task's, or S
+seconds. Times are medians of calls in one process; the last column is the time that all of these
+took to compile, in seconds. To compare two versions, run this file with PYTHONPATH set to either
+checkout.
 """
 
 from __future__ import annotations
