@@ -391,8 +391,8 @@ def _moved(
     A, B = derivatives.dynamics.A, derivatives.dynamics.B
     ray = Ray(problem, knots, d, reach, A + B @ gains, gains, eta, rho, promised, rows, now.funnel)
     gain = jnp.abs(promised[0]) / scales.cost
-    ends = ok & (jnp.maximum(residual.total, gain) < polish.tolerance)
-    alpha, X, parts = line_search(ray, ok & needed & ~ends)
+    done = ok & (jnp.maximum(residual.total, gain) < polish.tolerance)
+    alpha, X, parts = line_search(ray, ok & needed & ~done)
     found = ok & (alpha > 0.0)
     alpha = jnp.where(found, alpha, 0.0)
     X = jax.tree.map(lambda a, b: jnp.where(found, a, b), X, knots)
@@ -412,7 +412,7 @@ def _moved(
     most = 1e-2 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
     stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
     blocked = jnp.minimum(RAISE * rho, 0.1 * scales.terms)
-    arrived = replace(now, optimal=ends, residual=jnp.maximum(residual.total, gain))
+    arrived = replace(now, optimal=done, residual=jnp.maximum(residual.total, gain))
     moved = replace(
         now,
         barrier=jnp.where(reach < BLOCKED, jnp.maximum(rho, blocked), rho),
@@ -432,8 +432,9 @@ def _moved(
         gains=jnp.where(ok, gains, state.gains),
         polish=moved,
     )
-    kept = replace(state, polish=arrived)
-    return jax.tree.map(lambda a, b: jnp.where(ends, a, b), kept, new)
+    here = replace(state, polish=arrived)
+    chosen: State = jax.tree.map(lambda a, b: jnp.where(done, a, b), here, new)
+    return chosen
 
 
 def _barrier(

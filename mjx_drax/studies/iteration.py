@@ -52,7 +52,7 @@ def times(problem: Problem, chains: int, repeats: int) -> tuple[list[float], flo
         (newton, recursion),
         (lambda s: flow.step(problem, s, 0, tail=False)[0], (states,)),
         (lambda s: flow.step(problem, s, flow.iterations, noise=False)[0], (states,)),
-        (partial(iteration, 0, polished), (inside,)),
+        (partial(iteration, jax.numpy.zeros((), int), polished), (inside,)),
     ]
     seconds, compiling = [], 0.0
     for part, arguments in parts:
