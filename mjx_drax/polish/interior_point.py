@@ -389,7 +389,19 @@ def _moved(
     promised = of_cost - rho * _logs(ends, moves, reach), of_defects
     rows = Multipliers(scales.x, Stagewise(*row_scales(derivatives, scales, model.trajectory)))
     A, B = derivatives.dynamics.A, derivatives.dynamics.B
-    ray = Ray(problem, knots, d, reach, A + B @ gains, gains, eta, rho, promised, rows, now.funnel)
+    ray = Ray(
+        problem=problem,
+        knots=knots,
+        d=d,
+        reach=reach,
+        closed=A + B @ gains,
+        gains=gains,
+        eta=eta,
+        rho=rho,
+        promised=promised,
+        rows=rows,
+        funnel=now.funnel,
+    )
     gain = jnp.abs(promised[0]) / scales.cost
     done = ok & (jnp.maximum(residual.total, gain) < polish.tolerance)
     alpha, X, parts = line_search(ray, ok & needed & ~done)

@@ -363,3 +363,22 @@ def test_what_actuators_remember_is_not_taken_from_a_replay_before():
     first, _, again = ran(1.0), ran(-5.0), ran(1.0)
     assert len(spare.data) == 1
     np.testing.assert_array_equal(first, again)
+
+
+def test_threads_go_by_the_work_of_a_knot(monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    unknown, light, heavy = (Spare(seconds=s) for s in (np.inf, 5e-5, 1.4e-3))
+    assert [unknown.threads(n) for n in (1, 8, 9, 64, 999)] == [1, 1, 2, 8, 16]
+    assert [light.threads(n) for n in (1, 8, 9, 64, 999)] == [1, 1, 2, 8, 16]
+    assert [heavy.threads(n) for n in (1, 4, 64)] == [1, 4, 16]
+
+
+def test_a_stepper_learns_how_long_a_knot_takes():
+    model, spare = mujoco.MjModel.from_xml_string(SWINGING), Spare()
+    with Stepper(model, 3, np.zeros((5, model.nq + model.nv + model.na)), spare) as stepper:
+        stepper(np.zeros((5, model.nu)))
+    first = spare.seconds
+    assert 0.0 < first < 1.0
+    with Stepper(model, 3, np.zeros((5, model.nq + model.nv + model.na)), spare) as stepper:
+        stepper(np.zeros((5, model.nu)))
+    assert spare.seconds <= first
