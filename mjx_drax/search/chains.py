@@ -163,16 +163,22 @@ def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
         return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
 
     infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
-    of = np.concatenate([np.arange(chains), owners])
-    missed = both(lambda a: a.missed)
-    order = np.lexsort((value, missed, infeasible, of))
-    source = order[np.unique(of[order], return_index=True)[1]]
+    of, missed = np.concatenate([np.arange(chains), owners]), both(lambda a: a.missed)
+    source = first_of(of, infeasible, value, missed)
     pairs = (kept.state, kept.info), (found.state, found.info)
     if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(pairs)):
         state, info = jax.tree.map(lambda a, b: np.concatenate([a, b])[source], *pairs)
     else:
         state, info = gather(*pairs, source)
     return Chains(state, info, both(lambda a: a.feasible_since)[source], missed[source])
+
+
+def first_of(
+    of: np.ndarray, infeasible: np.ndarray, value: np.ndarray, missed: np.ndarray
+) -> np.ndarray:
+    """Which row is the best `of` each chain, as `best_of` says; the earlier one of equals."""
+    order = np.lexsort((value, missed, infeasible, of))
+    return order[np.unique(of[order], return_index=True)[1]]
 
 
 @jax.jit

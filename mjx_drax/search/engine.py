@@ -58,6 +58,7 @@ from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
     begin,
+    box_of_controls,
     chain_keys,
     iterate,
     joined,
@@ -67,6 +68,7 @@ from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.replayer import Replayer
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
+from mjx_drax.search.shooting import Shots, shoot
 from mjx_drax.search.sizes import median, scale_and_floor, sizes_of
 from mjx_drax.search.warm import Warm, warmed
 
@@ -391,7 +393,7 @@ class Search:
         assert rollouts is not None
         polished = self.polish is not None
         asked = self.family.alone and polished and not self._thorough
-        return asked and rollouts.first + rollouts.rounds == 0
+        return asked and not rollouts.asked
 
     @property
     def _thorough(self) -> bool:
@@ -654,8 +656,7 @@ class Search:
         """The rollouts that follow an attempt; False if they are interrupted. See `Rollouts`."""
         rollouts, stage = self.settings.rollouts, self.stage
         assert rollouts is not None
-        total = rollouts.first + rollouts.rounds
-        if total == 0:
+        if not rollouts.asked:
             return True
         now = self._whole(stage.now)
         better = np.zeros(len(stage.owners), bool)
@@ -672,20 +673,63 @@ class Search:
             return True
         try:
             self.stage = replace(stage, now=now)
-            while self.stage.rollouts < total:
-                self._next_rollout(rollouts.first, rollouts.iterations, total)
+            while self.stage.rollouts < rollouts.total:
+                if self.stage.rollouts < rollouts.first:
+                    self._next_rollout()
+                elif self.stage.rollouts == rollouts.shoot_at:
+                    self._shoot()
+                else:
+                    self._next_round()
         except KeyboardInterrupt:
             return False
         return True
 
-    def _next_rollout(self, first: int, iterations: int, total: int) -> None:
-        """A rollout without feedback, then with it, then rounds of iterations and rollouts."""
+    def _shoot(self) -> None:
+        """Random shooting, from where they are, by chains that are not sound yet."""
+        stage, rollouts, replayer = self.stage, self.settings.rollouts, self._replayer
+        assert rollouts is not None
+        now, rows, ended = stage.now, np.flatnonzero(~stage.now.sound), True
+        if len(rows):
+            knots = replace(now.state.trajectory, slack=None)
+            box = box_of_controls(*reversed(self.question), knots)
+            keys = np.stack([replayer.of[rows], rows % self.chains], axis=1)
+
+            def told(shots: Shots) -> None:
+                cost, worst = jnp.asarray(now.info.cost), jnp.asarray(now.info.max_defect)
+                cost, worst = cost.at[rows].set(shots.cost), worst.at[rows].set(shots.broken)
+                info = replace(now.info, cost=cost, max_defect=worst)
+                self._tell(replace(stage, now=replace(now, info=info)), stage.done)
+
+            shots, ended = shoot(
+                lambda some, controls: replayer.fired(knots, rows[some], controls),
+                np.asarray(knots.u)[rows],
+                [np.asarray(end, float)[rows] for end in box],
+                replayer.floor[rows],
+                [(self.seed, stage.attempt, *key) for key in keys.tolist()],
+                (rollouts.samples, rollouts.generations),
+                told,
+            )
+            found = replayer.taken(now, rows, shots, stage.done)
+            now = best_of(now, found, np.arange(len(stage.owners)))
+        damping = stage.damping.copy()
+        damping[rows] = 1.0
+        self.stage = replace(stage, now=now, damping=damping, rollouts=stage.rollouts + 1)
+        if not ended:
+            raise KeyboardInterrupt
+
+    def _next_rollout(self) -> None:
+        """A rollout without feedback, later ones with it."""
+        stage = self.stage
+        now = self._replayer.rolled_out(stage.now, float(stage.rollouts > 0), stage.done)
+        self.stage = replace(stage, now=now, rollouts=stage.rollouts + 1)
+
+    def _next_round(self) -> None:
+        """A round: iterations, and the rollouts of what they have changed."""
         stage, everyone = self.stage, np.arange(len(self.stage.owners))
+        rollouts = self.settings.rollouts
+        assert rollouts is not None
         now, damping, count = stage.now, stage.damping, stage.rollouts + 1
-        if stage.rollouts < first:
-            now = self._replayer.rolled_out(now, float(stage.rollouts > 0), stage.done)
-            self.stage = replace(stage, now=now, rollouts=count)
-            return
+        iterations = rollouts.iterations
         done, end = stage.done + iterations, self.flow.iterations + self.settings.after
         # Chains that the largest damping has left as they were would come to the same again
         rows, most = np.flatnonzero(np.isfinite(damping)), DAMPING_RANGE[1]
@@ -701,7 +745,9 @@ class Search:
         settled = same & (better == 0.0) & (damping >= most)
         damping = np.where(settled, np.inf, np.clip(damping * factor, *DAMPING_RANGE))
         if not better.any() and (damping >= most).all():
-            count = total  # more would change nothing
+            # More rounds would change nothing
+            shoots = stage.rollouts < rollouts.shoot_at and not now.sound.all()
+            count = rollouts.shoot_at if shoots else rollouts.total
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
 
     # Reports, recordings, checkpoints
@@ -713,11 +759,15 @@ class Search:
         self.stage = stage
         self._record()
         self._save()
+        self._tell(stage, done)
+
+    def _tell(self, stage: Stage, done: int) -> None:
+        """Tell how far it is; KeyboardInterrupt, which keeps what there is, if time is over."""
         if self.progress is not None:
             begun = done - stage.step + self.flow.iterations + self.settings.after
             self.progress(done, max(begun, done), stage.now.info)
         if time.perf_counter() - self.clock > self.seconds:
-            raise KeyboardInterrupt  # which keeps what there is
+            raise KeyboardInterrupt
 
     def _record(self) -> None:
         """Record knots too, if asked for."""

@@ -27,12 +27,15 @@ from mjx_drax.method.langevin import Langevin, State, keep_finite
 from mjx_drax.method.model import expand
 from mjx_drax.polish import interior_point
 from mjx_drax.polish.interior_point import Polish
-from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.problem import PARTS, Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.scaled import without_units
 
 FEASIBLE = 1e-3
 """Largest max|h| of a feasible chain: of defects in `Problem.defect_scale`, and of constraints."""
+
+BOUND = 5e-3
+"""Share of the box of states by which a rollout may leave it and be polished back."""
 
 Tree = TypeVar("Tree")
 
@@ -144,6 +147,38 @@ def worst_constraints(own: Question, shared: Question, knots: Trajectory) -> Arr
 
     worst: Array = by_row(shared, own, of_row, knots)
     return worst
+
+
+@jax.jit
+def box_of_controls(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
+    """The ends of the box that each row's initial controls are drawn from, each (rows, K, nu)."""
+
+    def of_row(q: Question, knots: Trajectory) -> tuple[Array, Array]:
+        box = q.problem.scatter
+        shape = knots.u.shape
+        return jnp.broadcast_to(box.u_lower, shape), jnp.broadcast_to(box.u_upper, shape)
+
+    ends: tuple[Array, Array] = by_row(shared, own, of_row, knots)
+    return ends
+
+
+@jax.jit
+def judged(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
+    """Cost of rollouts (samples, rows, K, ...), and by how much they break what must hold.
+
+    That is the largest violation of a constraint, or of a bound of states in `BOUND` of their box.
+    """
+
+    def of_row(q: Question, knots: Trajectory) -> tuple[Array, Array]:
+        problem = q.problem
+        inside = replace(q.flow, bounds=Projection()).inside(problem, knots)
+        off = jax.vmap(problem.dynamics.difference)(knots.x, inside.x) / problem.defect_scale
+        worst = problem.worst_constraint(problem.constraints(knots))
+        outside = FEASIBLE / (PARTS * BOUND) * jnp.abs(off).max(initial=0.0)
+        return problem.cost(knots), jnp.maximum(worst, outside)
+
+    found: tuple[Array, Array] = jax.lax.map(partial(by_row, shared, own, of_row), knots)
+    return found
 
 
 def loop(

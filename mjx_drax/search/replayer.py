@@ -15,7 +15,15 @@ from mjx_drax.method.langevin import State
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.chains import Chains, best_of, improved
 from mjx_drax.search.family import Family, Tracked
-from mjx_drax.search.iterate import FEASIBLE, Question, between, restart_at, worst_constraints
+from mjx_drax.search.iterate import (
+    FEASIBLE,
+    Question,
+    between,
+    judged,
+    restart_at,
+    worst_constraints,
+)
+from mjx_drax.search.shooting import Shots
 
 SHARES = (0.5, 0.2, 0.05)
 """Of what a round has changed, these are rolled out where all of it brings no improvement."""
@@ -78,6 +86,38 @@ class Replayer:
             better = np.where(improved(now, part, self.floor), np.maximum(better, share), better)
             found = best_of(found, part, np.arange(len(better)))
         return found, better
+
+    def fired(self, knots: Trajectory, rows: np.ndarray, controls: np.ndarray) -> Shots:
+        """Rollouts of controls (n, samples, K, nu) of `rows` (n,), without feedback, row by row.
+
+        They start where the knots (all rows, K, ...) do.
+        """
+        family, samples = self.family, controls.shape[1]
+        dynamics, K = family.problem.dynamics, family.problem.horizon
+        x_0 = np.repeat(family.starts(self.indices, knots)[rows], samples, axis=0)
+        plan = np.broadcast_to(x_0[:, None], (len(x_0), K + 1, dynamics.nx))
+        u = controls.reshape(-1, K, dynamics.nu)
+        gains = np.broadcast_to(0.0, (*u.shape, dynamics.ndx))
+        states, applied = family.replay(np.repeat(self.of[rows], samples), plan, u, gains)
+        missed = np.zeros(len(u), bool)
+        if family.problem.goal is not None:
+            missed = ~family.reached(states)
+        # All rows, as numbers of problems belong to rows; those not asked for stand still
+        all_x, all_u = (np.repeat(np.asarray(a)[None], samples, axis=0) for a in (knots.x, knots.u))
+        all_x[:, rows] = states[:, 1:].reshape(len(rows), samples, K, -1).swapaxes(0, 1)
+        all_u[:, rows] = applied.reshape(len(rows), samples, K, -1).swapaxes(0, 1)
+        start = None
+        if knots.start is not None:
+            start = jnp.broadcast_to(knots.start, (samples, *knots.start.shape))
+        tried = Trajectory(jnp.asarray(all_x), jnp.asarray(all_u), start=start)
+        both = judged(self.question[1], self.question[0], tried)
+        cost, broken = (np.asarray(a, float)[:, rows].T.ravel() for a in both)
+        return Shots(states, applied, cost, broken, missed)
+
+    def taken(self, chains: Chains, rows: np.ndarray, shots: Shots, done: int) -> Chains:
+        """Shots of `rows`, one of each, as chains to go on from; others are infinitely bad."""
+        ran = shots.states, shots.controls, shots.missed
+        return self._as_knots(chains, rows, *ran, done, None)
 
     def _better(
         self,

@@ -18,8 +18,9 @@ Schedules are multiples of scales that are measured, so no setting depends on th
 Costs are measured from their floor (`sizes`), so constants that are added to them change nothing.
 Where a Gauss-Newton flow is polished, states and controls are measured by their box (`scaled`).
 
-Where f has kinks (contacts, limits, dry friction), `Rollouts` follow each attempt, and noise seldom
-helps: there attempts are heated, in turns with others, only as long as none has made a chain done.
+Where f has kinks (contacts, limits, dry friction), `Rollouts` follow each attempt, with random
+shooting, and noise seldom helps: there attempts are heated, in turns with others, only as long as
+none has made a chain done.
 A touch a moment later may cost much more, so all descents can end before the same narrow wall.
 """
 
@@ -65,15 +66,38 @@ class Rollouts:
     kept. Where it is not, shares of the change are rolled out, down to a twentieth, and the chain
     is damped more if none of them helps.
 
+    No derivative tells that a push would help where nothing touches. So after a third of the
+    rounds, or when they change nothing more, random shooting (`shooting`) improves the controls of
+    chains that still miss the goal or break a constraint. The other rounds start from there.
+
     Attributes:
         first: rollouts right after the attempt: one without feedback, the others with it.
         rounds: largest number of rounds that follow; 0 with first=0: no rollouts.
         iterations: in each round; the first and the last of a polish take no step.
+        samples: random changes of a chain's controls in a generation of random shooting; 0: none.
+        generations: the most; a chain has fewer if ten have brought it nothing.
     """
 
     first: int = 2
     rounds: int = 30
     iterations: int = 6
+    samples: int = 32
+    generations: int = 100
+
+    @property
+    def asked(self) -> bool:
+        """Whether there are any."""
+        return self.first + self.rounds > 0
+
+    @property
+    def shoot_at(self) -> int:
+        """After how many rollouts and rounds random shooting comes; -1 for never."""
+        return self.first + self.rounds // 3 if self.samples * self.generations else -1
+
+    @property
+    def total(self) -> int:
+        """Number of rollouts and rounds, and random shooting."""
+        return self.first + self.rounds + (self.shoot_at >= 0)
 
 
 @dataclass(frozen=True)
@@ -200,7 +224,7 @@ class Restarts:
             require_whole("polish.patience", self.polish.patience)
         if not isinstance(self.rollouts, Rollouts | None):
             raise DraxError(f"rollouts is {shown(self.rollouts)}: give Rollouts() or None.")
-        for name in ("first", "rounds", "iterations") if self.rollouts else ():
+        for name in vars(self.rollouts) if self.rollouts else ():
             least = 1 if name == "iterations" else 0
             require_whole(f"rollouts.{name}", getattr(self.rollouts, name), least)
 
@@ -250,7 +274,7 @@ def settled(
     settings.check(problem)
     settings = _polished(settings, problem, tolerance, max_iterations).for_problem(problem)
     rollouts = settings.rollouts
-    if rollouts and rollouts.first + rollouts.rounds and rollouts.iterations > settings.after:
+    if rollouts and rollouts.asked and rollouts.iterations > settings.after:
         raise DraxError(
             f"rollouts.iterations is {rollouts.iterations}, more than the {settings.after} that "
             "follow the noise: give at most so many, or more iterations of the polish or the tail."
