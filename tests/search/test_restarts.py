@@ -335,7 +335,8 @@ def test_rollouts_follow_where_f_has_kinks(balls):
 
 @pytest.mark.slow
 def test_where_all_that_a_round_changes_is_worse_a_share_of_it_helps(balls, monkeypatch):
-    solver = Restarts(attempts=1, polish=Polish(iterations=0))
+    no_shots = Rollouts(samples=0)
+    solver = Restarts(attempts=1, rollouts=no_shots, polish=Polish(iterations=0))
     in_part = solve(balls[1], chains=8, solver=solver)
     monkeypatch.setattr("mjx_drax.search.replayer.SHARES", (1.0,))  # all of it once more
     whole = solve(balls[1], chains=8, solver=solver)
@@ -396,7 +397,7 @@ def test_a_rollout_that_reaches_the_goal_is_feasible_by_what_replays_it(fastest,
         x_scatter=(-1.0, 1.0),
         goal=goal,
     )
-    rollouts = Rollouts(rounds=0, iterations=1)
+    rollouts = Rollouts(rounds=0, iterations=1, samples=0)
     flow, no_polish = replace(SHORT, tail=1), Polish(iterations=0)
     once = Restarts(flow, descent=1, attempts=1, rollouts=rollouts, polish=no_polish)
     found = solve(problem, 4, solver=once)

@@ -4,12 +4,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from jax.tree_util import Partial
 
-from mjx_drax import Restarts, Trajectory, from_dynamics, solve, solve_batch
+from mjx_drax import Restarts, Trajectory, from_dynamics, from_mjcf, solve, solve_batch
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.modelling.terms import Terms
 from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.search.restarts import Rollouts
 from mjx_drax.search.shooting import PATIENCE, SMALLEST, Shots, changes, shoot
@@ -184,3 +186,34 @@ def test_problems_of_a_batch_shoot_as_if_alone():
 
 def with_start(problem, x):
     return replace(problem, x_init=x)
+
+
+FLICK = """<mujoco><option timestep="0.005"/><worldbody>
+<body pos="0 0 0.5"><joint name="shoulder" axis="0 1 0" damping="0.05"/>
+  <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3" contype="0" conaffinity="0"/>
+  <body pos="0.2 0 0"><joint name="elbow" axis="0 1 0" damping="0.05"/>
+    <geom type="capsule" fromto="0 0 0 0.18 0 0" size="0.02" mass="0.2"/></body></body>
+<body pos="0.45 0 0.35"><joint name="spin" axis="0 1 0" damping="0.02"/>
+  <geom type="capsule" fromto="-0.12 0 0 0.12 0 0" size="0.03" mass="0.3"/></body>
+</worldbody><actuator><motor joint="shoulder" gear="2" ctrlrange="-1 1"/>
+<motor joint="elbow" gear="1" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.slow
+def test_an_arm_flicks_a_wheel_from_below():
+    """It has to go around the wheel; descents end where nothing touches, at a cost of 72."""
+    on = Terms(mujoco.MjModel.from_xml_string(FLICK))
+    problem = from_mjcf(
+        on.model,
+        horizon=1.0,
+        dt=0.02,
+        running_residual=on.control(weight=1e-2) + on.velocity(weight=1e-4),
+        terminal_residual=on.posture({"spin": 1.2}, weight=100.0) + on.velocity(weight=0.1),
+        goal=lambda data: abs(data.qpos[2] - 1.2) < 0.2,
+    )
+    still = solve(problem, 4, solver=Restarts(attempts=1, rollouts=Rollouts(samples=0)))
+    assert not still.success.any()
+    found = solve(problem, 4, solver=Restarts(attempts=1))
+    assert found.success.all()
+    assert found.certified
+    assert found.replay_cost.max() < 1.0
