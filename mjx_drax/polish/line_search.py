@@ -130,6 +130,10 @@ def _in_stages(has_rows: tuple[bool, ...], ray: Ray, needed: Array) -> Found:
     n = next((len(a) for a, rows in zip(arrays, own, strict=True) if rows), 1)
     needed = jnp.broadcast_to(needed, (n,))
     of_row = jax.tree.unflatten(tree, [0 if rows else None for rows in own])
+    if jax.tree.leaves(of_row.problem):
+        # Of a batch: its problems share nothing, as answers must not depend on others by a bit
+        apart: Found = jax.vmap(_side_by_side, in_axes=(of_row,))(ray)
+        return apart
     slots, count = jnp.arange(n), len(LADDER)
     ladder = jnp.asarray((0.0, *LADDER), ray.d.u.dtype)
 
