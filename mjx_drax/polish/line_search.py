@@ -108,7 +108,10 @@ def _side_by_side(ray: Ray) -> Found:
 
 
 def _by_need(ray: Ray, needed: Array) -> Found:
-    """Sizes one after the other; rows that need more of them share the work of the others."""
+    """Sizes one after the other; rows that need more of them share the work of the others.
+
+    Rounding of a row then depends on the others, so rows of different problems do not share.
+    """
 
     def one(ray: Ray, needed: Array) -> Found:
         none = (False,) * len(jax.tree.leaves((ray, needed)))
@@ -131,7 +134,6 @@ def _in_stages(has_rows: tuple[bool, ...], ray: Ray, needed: Array) -> Found:
     needed = jnp.broadcast_to(needed, (n,))
     of_row = jax.tree.unflatten(tree, [0 if rows else None for rows in own])
     if jax.tree.leaves(of_row.problem):
-        # Of a batch: its problems share nothing, as answers must not depend on others by a bit
         apart: Found = jax.vmap(_side_by_side, in_axes=(of_row,))(ray)
         return apart
     slots, count = jnp.arange(n), len(LADDER)

@@ -762,7 +762,7 @@ class Search:
         self._tell(stage, done)
 
     def _tell(self, stage: Stage, done: int) -> None:
-        """Tell how far it is; KeyboardInterrupt, which keeps what there is, if time is over."""
+        """Tell how far it is; after `seconds` raise KeyboardInterrupt: what there is stays."""
         if self.progress is not None:
             begun = done - stage.step + self.flow.iterations + self.settings.after
             self.progress(done, max(begun, done), stage.now.info)
