@@ -664,15 +664,19 @@ class Search:
             # The attempt may have lost contacts of the guess: rollouts then start from the guess
             guessed = self._replayer.rolled_out(self._guessed(), 0.0, stage.done)
             now, better = self._no_worse(now, guessed)
+        damping, count = stage.damping, stage.rollouts
         if (
-            stage.rollouts == 0
+            count == 0
             and not better.any()
             and now.feasible.all()
             and not self._replayer.missed(now).any()
         ):
-            return True
+            if rollouts.shoot_at < 0 or not self._unsure(now).any():
+                return True
+            # Rounds are for what random shooting changes
+            damping, count = np.full_like(damping, np.inf), rollouts.shoot_at
         try:
-            self.stage = replace(stage, now=now)
+            self.stage = replace(stage, now=now, damping=damping, rollouts=count)
             while self.stage.rollouts < rollouts.total:
                 if self.stage.rollouts < rollouts.first:
                     self._next_rollout()
@@ -684,11 +688,19 @@ class Search:
             return False
         return True
 
+    def _unsure(self, now: Chains) -> np.ndarray:
+        """Which chains random shooting may help, (rows,): those that are not sound.
+
+        Without a goal all of them: a motion that touches nothing may be sound, and worth nothing.
+        """
+        return ~now.sound | (self.family.problem.goal is None)
+
     def _shoot(self) -> None:
-        """Random shooting, from where they are, by chains that are not sound yet."""
+        """Random shooting, from where they are, by chains that it may help."""
         stage, rollouts, replayer = self.stage, self.settings.rollouts, self._replayer
         assert rollouts is not None
-        now, rows, ended = stage.now, np.flatnonzero(~stage.now.sound), True
+        now, damping, ended = stage.now, stage.damping, True
+        rows = np.flatnonzero(self._unsure(now))
         if len(rows):
             knots = replace(now.state.trajectory, slack=None)
             box = box_of_controls(*reversed(self.question), knots)
@@ -710,10 +722,10 @@ class Search:
                 told,
             )
             found = replayer.taken(now, rows, shots, stage.done)
-            now = best_of(now, found, np.arange(len(stage.owners)))
-        damping = stage.damping.copy()
-        damping[rows] = 1.0
-        self.stage = replace(stage, now=now, damping=damping, rollouts=stage.rollouts + 1)
+            before, now = now, best_of(now, found, np.arange(len(stage.owners)))
+            damping = np.where(_same(before, now), damping, 1.0)
+        count = stage.rollouts + 1 if np.isfinite(damping).any() else rollouts.total
+        self.stage = replace(stage, now=now, damping=damping, rollouts=count)
         if not ended:
             raise KeyboardInterrupt
 
@@ -739,14 +751,12 @@ class Search:
         found = self._whole(Chains(state, info, np.full(len(everyone), done), missed))
         found, better = self._replayer.rolled_out_in_part(now, found, rows, done)
         before, now = now, best_of(now, found, everyone)
-        of_both = (np.stack([a.cost, a.info.max_defect]) for a in (before, now))
-        same = np.equal(*of_both).all(axis=0)
         factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))
-        settled = same & (better == 0.0) & (damping >= most)
+        settled = _same(before, now) & (better == 0.0) & (damping >= most)
         damping = np.where(settled, np.inf, np.clip(damping * factor, *DAMPING_RANGE))
         if not better.any() and (damping >= most).all():
             # More rounds would change nothing
-            shoots = stage.rollouts < rollouts.shoot_at and not now.sound.all()
+            shoots = stage.rollouts < rollouts.shoot_at and self._unsure(now).any()
             count = rollouts.shoot_at if shoots else rollouts.total
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
 
@@ -868,6 +878,12 @@ class Search:
         if self.checkpoint is not None:
             solve_time = time.perf_counter() - self.clock
             self.checkpoint.save(lambda: self._saved(solve_time, ended), now)
+
+
+def _same(before: Chains, now: Chains) -> np.ndarray:
+    """Which chains nothing better was found for, (rows,)."""
+    of_both = (np.stack([a.cost, a.info.max_defect]) for a in (before, now))
+    return np.equal(*of_both).all(axis=0)
 
 
 @partial(jax.jit, static_argnames=("chains", "guess"))

@@ -171,12 +171,11 @@ class Replayer:
         rolled = Trajectory(jnp.asarray(x), jnp.asarray(u), start=knots.start)
         state = restart_at(self.question[1], self.question[0], chains.state, rolled)
         state, info = self.diagnosed(state)
-        own = np.zeros(len(x), bool)
-        if self.family.problem.goal is not None:
-            ran_to = replace(state.trajectory, slack=None)
-            may_win = ~late if kept is None else ~late & ~(kept.sound_cost <= np.asarray(info.cost))
-            own, info = late, self._by_the_engine(info, ran_to, may_win)
-        return _only(Chains(state, info, np.full(len(x), done), own), rows)
+        if self.family.problem.goal is None:  # a motion of the engine is all that is asked for
+            late = np.zeros(len(x), bool)
+        may_win = ~late if kept is None else ~late & ~(kept.sound_cost <= np.asarray(info.cost))
+        info = self._by_the_engine(info, replace(state.trajectory, slack=None), may_win)
+        return _only(Chains(state, info, np.full(len(x), done), late), rows)
 
     def _plans(self, knots: Trajectory) -> np.ndarray:
         """x_0..x_K of knots (rows, K, ...), (rows, K + 1, nx)."""
@@ -186,7 +185,7 @@ class Replayer:
         """Diagnostics of rollouts; max|h| of `chosen` ones (rows,) as the replaying engine has it.
 
         Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
-        that reaches the goal is a motion of the engine: it counts, if it keeps the constraints.
+        is a motion of the engine: where it reaches the goal it counts, if it keeps the constraints.
         """
         family, defect = self.family, np.array(info.max_defect)
         which = np.flatnonzero(chosen & ~(defect < FEASIBLE))

@@ -130,10 +130,23 @@ def pushed(x, u):
     return jnp.array([x[0] + 0.05 * u[0], x[1] + 0.05 * speed, speed])
 
 
-def pusher():
+@register_dataclass
+@dataclass(frozen=True)
+class Rougher(Pusher):
+    """As the replaying engine has it, the ball is a little rougher than f says."""
+
+    def replay(self, *given):
+        return Pusher(Partial(rougher), self.dt, self.nx, self.nu).replay(*given)
+
+
+def rougher(x, u):
+    return pushed(x, u) - jnp.array([0.0, 0.0, 0.002]) * x[2]
+
+
+def pusher(kind=Pusher):
     """The ball is to lie 1 m further; the hand starts half a metre behind it, at rest."""
     return from_dynamics(
-        Pusher(Partial(pushed), 0.05, 3, 1),
+        kind(Partial(pushed), 0.05, 3, 1),
         x_init=[-0.5, 0.0, 0.0],
         horizon=1.5,
         running_residual=lambda x, u: 0.1 * u,
@@ -169,6 +182,19 @@ def test_chains_that_touch_nothing_find_the_contact():
     assert (early.replay_cost < 40.0).all()
     np.testing.assert_allclose(early.replay_cost, calls[-1], rtol=1e-4)
     assert found.replay_cost.mean() < early.replay_cost.mean()
+
+
+def test_without_a_goal_chains_that_touch_nothing_are_not_enough():
+    """They are certified, and cost 50. What a shot does in the engine counts, whatever f says."""
+    problem = replace(pusher(Rougher), goal=None)
+    given = {"chains": 4, "guess": STILL, "progress": False}
+    still = solve(problem, solver=Restarts(**SHORT, rollouts=Rollouts(samples=0)), **given)
+    assert still.certified
+    np.testing.assert_allclose(still.replay_cost, 50.0, rtol=1e-3)
+    found = solve(problem, solver=Restarts(**SHORT), **given)
+    assert found.success.all()
+    assert found.certified
+    assert found.replay_cost.max() < 9.0
 
 
 @pytest.mark.slow
