@@ -383,10 +383,12 @@ class Heavier(FunctionDynamics):
         pytest.param(  # it breaks a constraint
             0.5, lambda x: abs(x[0] - 1.0) < 0.3, False, marks=pytest.mark.slow
         ),
-        pytest.param(5.0, None, False, marks=pytest.mark.slow),
+        pytest.param(5.0, lambda x: abs(x[0] - 3.0) < 0.3, False, marks=pytest.mark.slow),
+        pytest.param(5.0, None, True, marks=pytest.mark.slow),
+        pytest.param(0.5, None, False, marks=pytest.mark.slow),
     ],
 )
-def test_a_rollout_that_reaches_the_goal_is_feasible_by_what_replays_it(fastest, goal, keeps):
+def test_a_rollout_that_does_what_is_asked_is_feasible_by_what_replays_it(fastest, goal, keeps):
     problem = from_dynamics(
         Heavier(Partial(lambda x, u: x + DT * jnp.array([x[1], u[0] - jnp.sin(x[0])])), DT, 2, 1),
         x_init=[0.0, 0.0],
