@@ -671,10 +671,10 @@ class Search:
             and now.feasible.all()
             and not self._replayer.missed(now).any()
         ):
-            if rollouts.shoot_at < 0 or not self._unsure(now).any():
-                return True
             # Rounds are for what random shooting changes
-            damping, count = np.full_like(damping, np.inf), rollouts.shoot_at
+            damping, count = np.full_like(damping, np.inf), self._without_more_rounds(now)
+            if count == rollouts.total:
+                return True
         try:
             self.stage = replace(stage, now=now, damping=damping, rollouts=count)
             while self.stage.rollouts < rollouts.total:
@@ -687,6 +687,13 @@ class Search:
         except KeyboardInterrupt:
             return False
         return True
+
+    def _without_more_rounds(self, now: Chains) -> int:
+        """Where `Stage.rollouts` goes on if rounds change nothing: random shooting, or the end."""
+        rollouts = self.settings.rollouts
+        assert rollouts is not None
+        shoots = self.stage.rollouts <= rollouts.shoot_at and self._unsure(now).any()
+        return rollouts.shoot_at if shoots else rollouts.total
 
     def _unsure(self, now: Chains) -> np.ndarray:
         """Which chains random shooting may help, (rows,): those that are not sound.
@@ -755,9 +762,7 @@ class Search:
         settled = _same(before, now) & (better == 0.0) & (damping >= most)
         damping = np.where(settled, np.inf, np.clip(damping * factor, *DAMPING_RANGE))
         if not better.any() and (damping >= most).all():
-            # More rounds would change nothing
-            shoots = stage.rollouts < rollouts.shoot_at and self._unsure(now).any()
-            count = rollouts.shoot_at if shoots else rollouts.total
+            count = self._without_more_rounds(now)
         self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
 
     # Reports, recordings, checkpoints

@@ -68,8 +68,8 @@ class Rollouts:
 
     No derivative tells that a push would help where nothing touches. So after a third of the
     rounds, or when they change nothing more, random shooting (`shooting`) improves the controls of
-    chains that still miss the goal or break a constraint; without a goal, of all of them. The other
-    rounds start from there.
+    chains that still miss the goal or break a constraint; without a goal, of all of them, and at
+    once where all are feasible. The other rounds start from there.
 
     Attributes:
         first: rollouts right after the attempt: one without feedback, the others with it.
