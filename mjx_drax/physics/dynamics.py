@@ -32,7 +32,12 @@ from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
 from mjx_drax.physics.contacts.pairs import left_out as pairs_left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
-from mjx_drax.physics.mjx_model import has_constraints, kept_contacts, put_model
+from mjx_drax.physics.mjx_model import (
+    constraint_rows,
+    has_constraints,
+    kept_contacts,
+    put_model,
+)
 from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
@@ -246,6 +251,11 @@ class MjxDynamics(Dynamics):
     def kinked(self) -> bool:  # type: ignore[override]
         """Whether contacts, limits or dry friction act in f."""
         return has_constraints(self.model)
+
+    @property
+    def constraint_rows(self) -> int:  # type: ignore[override]
+        """Rows that a step solves constraint forces for, active or not."""
+        return constraint_rows(self.model)
 
     @property
     def state_damping(self) -> float:  # type: ignore[override]

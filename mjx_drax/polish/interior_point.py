@@ -392,6 +392,7 @@ def _moved(
     ray = Ray(
         problem=problem,
         knots=knots,
+        h=model.h,
         d=d,
         reach=reach,
         closed=A + B @ gains,

@@ -7,8 +7,9 @@ promised may let h grow up to the `funnel`, which then narrows: the merit functi
 short steps along curved constraints (Maratos 1978; a funnel: Gould and Toint 2010). So every step
 is tried `bent` along the dynamics too; of two of one size that of lower merit is taken.
 
-GPUs try all sizes of all chains at once. CPUs go from the largest to the smallest, and chains that
-have found a step leave their places to those that have not.
+GPUs try all sizes of all chains at once. CPUs, and GPUs where steps of f are DEAR, go from the
+largest to the smallest, and chains that have found a step leave their places to those that have
+not.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ ARMIJO = 1e-4
 LADDER = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 32, 1 / 128)
 """Sizes of steps that are tried, as shares of the way to the boundary."""
 
+DEAR = 1e6
+"""Where the work, not its launches, takes a GPU's time: chains x knots x ndx x constraint rows."""
+
 INSIDE = 0.99
 """Share of the way to their bounds that controls may be moved to bend a step."""
 
@@ -45,6 +49,7 @@ class Ray(NamedTuple):
     Attributes:
         problem: of the chain.
         knots: where it is.
+        h: defects and constraints there.
         d: the direction, in tangent space.
         reach: the largest size, up to the boundary.
         closed: A + B K of every stage, (K, ndx, ndx).
@@ -57,6 +62,7 @@ class Ray(NamedTuple):
 
     problem: Problem
     knots: Trajectory
+    h: Multipliers
     d: Trajectory
     reach: Array
     closed: Array
@@ -82,119 +88,117 @@ Found = tuple[Array, Trajectory, Array]
 
 def line_search(ray: Ray, needed: Array) -> Found:
     """The largest step of the ladder that helps; where it is not `needed`, any or none."""
-    return _side_by_side(ray) if on_gpu() else _by_need(ray, needed)
+
+    def one(ray: Ray, needed: Array) -> Found:
+        none = (False,) * len(jax.tree.leaves((ray, needed)))
+        found: Found = jax.tree.map(lambda a: a[0], _all_rows(none, ray, needed))
+        return found
+
+    found: Found = merged_vmaps(one, _all_rows)(ray, needed)
+    return found
+
+
+def _all_rows(has_rows: tuple[bool, ...], ray: Ray, needed: Array) -> Found:
+    """`line_search` of all n rows; see `merged_vmaps`."""
+    arrays, tree = jax.tree.flatten(ray)
+    own = has_rows[: len(arrays)]
+    n = next((len(a) for a, rows in zip(arrays, own, strict=True) if rows), 1)
+    of_row = jax.tree.unflatten(tree, [0 if rows else None for rows in own])
+    dynamics = ray.problem.dynamics
+    work = n * ray.d.u.shape[-2] * dynamics.ndx * dynamics.constraint_rows
+    if jax.tree.leaves(of_row.problem) or (on_gpu() and work < DEAR):
+        apart: Found = jax.vmap(_side_by_side, (of_row,), axis_size=n)(ray)
+        return apart
+    return _by_need(n, of_row, ray, jnp.broadcast_to(needed, (n,)))
 
 
 def _side_by_side(ray: Ray) -> Found:
-    """All sizes at once, and size 0, which the others are compared with."""
-    sizes = jnp.append(jnp.asarray(LADDER, ray.d.u.dtype) * ray.reach, 0.0)
+    """All sizes at once."""
+    sizes = jnp.asarray(LADDER, ray.d.u.dtype) * ray.reach
 
     def tried(new: Trajectory, first: Array) -> tuple[Trajectory, Any]:
         merits = jax.vmap(partial(_merits, ray))(new)
         bent = partial(_bent, ray, new, merits.h.dynamics)
-        return lax.cond(first, bent, lambda: new), (new, merits)
+        # else XLA may bend the step once more in every thread that computes a part of f
+        then = lax.optimization_barrier(lax.cond(first, bent, lambda: new))
+        return then, (new, merits)
 
     # where f is long, as with contacts, in a loop: so it compiles once
     unroll = 1 if ray.problem.dynamics.kinked else 2
     straight = jax.vmap(partial(_straight, ray))(sizes)
     ways, merits = lax.scan(tried, straight, jnp.array([True, False]), unroll=unroll)[1]
-    here = jax.tree.map(lambda a: a[0, -1], merits)
-    helps, bends, through = jax.vmap(partial(_judged, ray, here), in_axes=(0, 1))(sizes, merits)
-    helps = helps.at[-1].set(True)
+    judged = jax.vmap(partial(_judged, ray, _here(ray)), in_axes=(0, 1))
+    helps, bends, through = judged(sizes, merits)
     first = jnp.argmax(helps)
-    bent = bends[first] & (sizes[first] > 0.0)
-    chosen: Trajectory = jax.tree.map(lambda z: z[bent.astype(int), first], ways)
-    return sizes[first], chosen, through[first] & (sizes[first] > 0.0)
+    chosen: Trajectory = jax.tree.map(lambda z: z[bends[first].astype(int), first], ways)
+    return jnp.where(helps[first], sizes[first], 0.0), chosen, through[first] & helps[first]
 
 
-def _by_need(ray: Ray, needed: Array) -> Found:
+def _by_need(n: int, of_row: Ray, ray: Ray, needed: Array) -> Found:
     """Sizes one after the other; rows that need more of them share the work of the others.
 
-    Rounding of a row then depends on the others, so rows of different problems do not share.
-    """
-
-    def one(ray: Ray, needed: Array) -> Found:
-        none = (False,) * len(jax.tree.leaves((ray, needed)))
-        found: Found = jax.tree.map(lambda a: a[0], _in_stages(none, ray, needed))
-        return found
-
-    found: Found = merged_vmaps(one, _in_stages)(ray, needed)
-    return found
-
-
-def _in_stages(has_rows: tuple[bool, ...], ray: Ray, needed: Array) -> Found:
-    """`_by_need` of all n rows; see `merged_vmaps`.
-
     Each stage tries n steps, straight and bent: one of each row at first, then more of those that
-    are left. Before, size 0 of all is tried, which the others are compared with.
+    are left. Rounding of a row then depends on the others, so rows of different problems do not
+    share. `of_row` has 0 where arrays of the ray lead with the axis of rows, else None.
     """
-    arrays, tree = jax.tree.flatten(ray)
-    own = has_rows[: len(arrays)]
-    n = next((len(a) for a, rows in zip(arrays, own, strict=True) if rows), 1)
-    needed = jnp.broadcast_to(needed, (n,))
-    of_row = jax.tree.unflatten(tree, [0 if rows else None for rows in own])
-    if jax.tree.leaves(of_row.problem):
-        apart: Found = jax.vmap(_side_by_side, in_axes=(of_row,))(ray)
-        return apart
     slots, count = jnp.arange(n), len(LADDER)
-    ladder = jnp.asarray((0.0, *LADDER), ray.d.u.dtype)
+    ladder = jnp.asarray(LADDER, ray.d.u.dtype)
 
     def at(rows: Array) -> Ray:
-        taken = [a[rows] if rows_of else a for a, rows_of in zip(arrays, own, strict=True)]
-        found: Ray = jax.tree.unflatten(tree, taken)
-        return found
+        def taken(axis: int | None, a: Any) -> Any:
+            return a if axis is None else a[rows]
+
+        every: Ray = jax.tree.map(taken, of_row, ray, is_leaf=lambda axis: axis is None)
+        return every
 
     def each(function: Any, rays: Ray, *more: Any) -> Any:
-        return jax.vmap(function, in_axes=(of_row, *(0 for _ in more)))(rays, *more)
+        in_axes = (of_row, *(0 for _ in more))
+        return jax.vmap(function, in_axes, axis_size=n)(rays, *more)
 
     def one_bent(ray: Ray, straight: Trajectory, defects: Array) -> Trajectory:
         one = jax.tree.map(lambda a: a[None], (straight, defects))
         bent: Trajectory = jax.tree.map(lambda a: a[0], _bent(ray, *one))
         return bent
 
-    def open_rows(ok: Array, next_way: Array) -> Array:
-        return needed & ~ok & (next_way <= count)
+    def open_rows(ok: Array, next_size: Array) -> Array:
+        return needed & ~ok & (next_size < count)
+
+    here = each(_here, at(slots))
 
     @pruned
     def stage(carry: Any) -> Any:
-        next_way, ok, found, here = carry
-        begins = next_way[0] == 0
-        todo = jnp.where(begins, jnp.ones_like(ok), open_rows(ok, next_way))
-        share = jnp.where(begins, 1, n // jnp.maximum(todo.sum(), 1))
+        next_size, ok, found = carry
+        todo = open_rows(ok, next_size)
+        share = n // jnp.maximum(todo.sum(), 1)
         place, turn = slots // share, slots % share
         row = jnp.argsort(~todo, stable=True)[jnp.minimum(place, n - 1)]
-        way = next_way[row] + turn
-        valid = (place < todo.sum()) & (way <= count)
+        size = next_size[row] + turn
+        valid = (place < todo.sum()) & (size < count)
         rays = at(row)
-        sizes = ladder[jnp.minimum(way, count)] * rays.reach
+        sizes = ladder[jnp.minimum(size, count - 1)] * rays.reach
 
         def tried(new: Trajectory, first: Array) -> tuple[Trajectory, Any]:
-            nothing = partial(jax.tree.map, jnp.zeros_like, here)
-            merits = lax.cond(first | ~begins, lambda: each(_merits, rays, new), nothing)
+            merits = each(_merits, rays, new)
             bent = partial(each, one_bent, rays, new, merits.h.dynamics)
             return lax.cond(first, bent, lambda: new), (new, merits)
 
         straight = each(_straight, rays, sizes)
         ways, merits = lax.scan(tried, straight, jnp.array([True, False]))[1]
-        here = jax.tree.map(lambda a, b: jnp.where(begins, a[0], b), merits, here)
         base = jax.tree.map(lambda a: a[row], here)
         judged = jax.vmap(_judged, in_axes=(of_row, 0, 0, 1))
         helps, bends, through = judged(rays, base, sizes, merits)
-        helps &= valid & ~begins
-        first = jnp.full(n, n).at[row].min(jnp.where(helps, slots, n))
+        first = jnp.full(n, n).at[row].min(jnp.where(helps & valid, slots, n))
         hit, first = first < n, jnp.minimum(first, n - 1)
         chosen = jax.tree.map(lambda z: z[bends[first].astype(int), first], ways)
         new = sizes[first], chosen, through[first]
         taken = jax.vmap(jnp.where)
         found = jax.tree.map(lambda a, b: taken(hit, a, b), new, found)
-        return jnp.where(todo, next_way + share, next_way), ok | hit, found, here
+        return jnp.where(todo, next_size + share, next_size), ok | hit, found
 
-    rays, zero = at(slots), jnp.zeros(n, ladder.dtype)
-    knots = jax.eval_shape(partial(each, _straight), rays, zero)
-    here = jax.eval_shape(partial(each, _merits), rays, knots)
-    knots, here = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), (knots, here))
-    no, none_tried = jnp.zeros(n, bool), jnp.zeros(n, int)
-    begin = none_tried, no, (zero, knots, no), here
+    zero, no = jnp.zeros(n, ladder.dtype), jnp.zeros(n, bool)
+    knots = jax.eval_shape(partial(each, _straight), at(slots), zero)
+    knots = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), knots)
+    begin = jnp.zeros(n, int), no, (zero, knots, no)
     found: Found = lax.while_loop(lambda now: open_rows(now[1], now[0]).any(), stage, begin)[2]
     return found
 
@@ -222,22 +226,31 @@ def _bent(ray: Ray, straight: Trajectory, defects: Array) -> Trajectory:
     return replace(straight, x=x, u=u)
 
 
+def _here(ray: Ray) -> Merits:
+    """Where the chain is: f is known there."""
+    return _merits_of(ray, ray.knots, ray.problem.costs(ray.knots), ray.h)
+
+
 def _merits(ray: Ray, knots: Trajectory) -> Merits:
     """Of knots of the chain."""
-    problem, eta = ray.problem, ray.eta
-    values = problem.values(knots)
-    r = problem.with_slack(values.constraints, knots.slack)
+    values = ray.problem.values(knots)
+    h = Multipliers(values.defects, ray.problem.with_slack(values.constraints, knots.slack))
+    return _merits_of(ray, knots, values.costs, h)
+
+
+def _merits_of(ray: Ray, knots: Trajectory, costs: Array, h: Multipliers) -> Merits:
+    """Of knots whose costs and h are known."""
+    eta, rows = ray.eta, h.constraints
     penalties = jnp.append(
-        jnp.sum(eta.dynamics * jnp.abs(values.defects), axis=-1)
-        + jnp.sum(eta.constraints.stage * jnp.abs(r.stage), axis=-1),
-        jnp.sum(eta.constraints.terminal * jnp.abs(r.terminal)),
+        jnp.sum(eta.dynamics * jnp.abs(h.dynamics), axis=-1)
+        + jnp.sum(eta.constraints.stage * jnp.abs(rows.stage), axis=-1),
+        jnp.sum(eta.constraints.terminal * jnp.abs(rows.terminal)),
     )
-    costs = values.costs
-    for slack in jax.tree.leaves(slacks_of(problem, knots)):
+    for slack in jax.tree.leaves(slacks_of(ray.problem, knots)):
         logs = jnp.where(jnp.isinf(slack), 0.0, jnp.log(slack))
         place = slice(None, -1) if logs.ndim > 1 else -1  # at stages, or at the end
         costs = costs.at[place].add(-ray.rho * jnp.sum(logs, axis=-1))
-    return Merits(costs, penalties, Multipliers(values.defects, r))
+    return Merits(costs, penalties, h)
 
 
 def _judged(ray: Ray, here: Merits, size: Array, merits: Merits) -> tuple[Array, Array, Array]:

@@ -36,6 +36,7 @@ class Dynamics:
         dt: time between knots [s].
         kinked: whether f has kinks, as contacts make them. Then all chains start near x_init, and
             the default solver rolls plans out (`Restarts.rollouts`).
+        constraint_rows: rows that a step solves constraint forces for.
         state_damping: damping of states beside that of controls in `GaussNewton`.
         twice: whether the polish differentiates f twice; else it learns what curvature f has.
         checked: f has been tried where it was made, and need not be traced once more.
@@ -48,6 +49,7 @@ class Dynamics:
     nu: int
     dt: float
     kinked: bool = False
+    constraint_rows: int = 0
     state_damping: float = 1.0
     twice: bool = True
     checked: bool = False

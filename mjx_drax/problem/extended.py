@@ -78,7 +78,8 @@ class Extended(Dynamics):
     knot: Knot | None = None
 
     given_nx, nu, dt, engine = map(_of_inner, ("nx", "nu", "dt", "engine"))
-    kinked, twice, checked = map(_of_inner, ("kinked", "twice", "checked"))
+    kinked, constraint_rows = map(_of_inner, ("kinked", "constraint_rows"))
+    twice, checked = map(_of_inner, ("twice", "checked"))
     state_damping, fingerprint = map(_of_inner, ("state_damping", "fingerprint"))
     differentiator = _of_inner("differentiator")
     step_differentiator = _of_inner("step_differentiator")

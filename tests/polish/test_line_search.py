@@ -32,16 +32,16 @@ def rays(seed=0):
     away = Trajectory(jnp.asarray(-size * x), jnp.asarray(-size * u))
     none = Stagewise(jnp.zeros((K, 0)), jnp.zeros(0))
     gains = 0.1 * rng.normal(size=(ROWS, K, 1, 2))
+    knots = Trajectory(jnp.asarray(x), jnp.asarray(u))
+    no_rows = jax.tree.map(lambda a: jnp.zeros((ROWS, *a.shape)), none)
     rows = {
-        "knots": Trajectory(jnp.asarray(x), jnp.asarray(u)),
+        "knots": knots,
+        "h": Multipliers(jax.vmap(problem.defects)(knots), no_rows),
         "d": away,
         "reach": jnp.asarray(rng.uniform(0.5, 1.0, ROWS)),
         "closed": jnp.asarray(0.3 * rng.normal(size=(ROWS, K, 2, 2))),
         "gains": jnp.asarray(gains),
-        "eta": Multipliers(
-            jnp.asarray(rng.random((ROWS, K, 2))),
-            jax.tree.map(lambda a: jnp.zeros((ROWS, *a.shape)), none),
-        ),
+        "eta": Multipliers(jnp.asarray(rng.random((ROWS, K, 2))), no_rows),
         "funnel": jnp.asarray(rng.choice([0.0, 5.0], ROWS)),
     }
     common = {
@@ -63,7 +63,7 @@ def test_chains_that_share_their_work_take_the_steps_that_they_would_take_alone(
     rows, common = rays(seed)
     needed = jnp.asarray(np.random.default_rng(seed).random(ROWS) < 0.8)
     size, knots, through = searched(line_search._side_by_side, rows, common)
-    shared = searched(line_search._by_need, rows, common, needed)
+    shared = searched(line_search.line_search, rows, common, needed)
     steps = np.asarray(size / rows["reach"])
     assert len(np.unique(steps.round(4))) >= 5  # 0, too
     assert {0.0, *np.float32(LADDER).round(4)} >= set(steps.round(4).tolist())
@@ -79,6 +79,6 @@ def test_one_chain_alone_takes_the_same_step():
     size, knots, _ = searched(line_search._side_by_side, rows, common)
     for i in np.flatnonzero(np.asarray(size) > 0.0)[:4]:
         ray = Ray(**jax.tree.map(lambda a, i=i: a[i], rows), **common)
-        alone = line_search._by_need(ray, jnp.ones((), bool))
+        alone = line_search.line_search(ray, jnp.ones((), bool))
         np.testing.assert_allclose(alone[0], size[i], rtol=1e-6)
         np.testing.assert_allclose(alone[1].x, knots.x[i], rtol=1e-5, atol=1e-5)
