@@ -111,6 +111,40 @@ def test_a_cart_pole_is_a_few_hundred_operations():
     assert all(e.outvars[0].aval.size == 1 or e.primitive.name in moves for e in equations)
 
 
+def test_many_small_steps_are_a_loop_of_scalar_arithmetic(monkeypatch):
+    problem = from_mjcf(
+        path("cartpole"), horizon=0.2, dt=0.1, running_residual=lambda data, u: u
+    )  # ten steps of 0.01 s
+    dynamics = problem.dynamics
+    assert dynamics.substeps == 10
+    x, u = jnp.array([0.1, 0.4, -0.3, 0.2]), jnp.array([0.5])
+
+    def derivatives(dynamics, x, u):
+        return InScalars(Autodiff()).jacobian(
+            lambda dz: dynamics.step(x + dz[:4], u + dz[4:]), 5, jax.random.key(0)
+        )
+
+    program = jax.make_jaxpr(pruned(derivatives))(dynamics, x, u).jaxpr
+    loops = [body for name, body in operations(program) if name == "scan"]
+    assert len(loops) == 1
+    names = {name for name, _ in operations(loops[0])}
+    assert {"sin", "cos"} <= names
+    assert not names & {"dot_general", "gather", "scatter", "cholesky", "while"}
+    seen = jax.jit(derivatives)(dynamics, x, u)
+    monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, limit: function)
+    jax.clear_caches()
+    close(seen, jax.jit(derivatives)(dynamics, x, u), 1e-4)
+
+
+def operations(jaxpr):
+    """Names of the operations of a program and of all that it calls, with what they call."""
+    for equation in jaxpr.eqns:
+        inner = [getattr(p, "jaxpr", p) for p in equation.params.values() if hasattr(p, "eqns")]
+        yield equation.primitive.name, inner[0] if inner else None
+        for program in inner:
+            yield from operations(program)
+
+
 def after(dynamics):
     return np.asarray(dynamics.step(jnp.array([0.3, 0.2]), jnp.array([0.1])))
 

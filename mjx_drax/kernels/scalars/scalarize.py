@@ -11,7 +11,8 @@ Of the simplifications 0 x = 0, 0 / x = 0 and x - x = 0 hold for finite x only: 
 or NaN, the scalarized function returns the 0, not NaN; and x + 0 keeps the sign of x = -0. What is
 left of a difference to f is rounding, because sums are taken in another order.
 
-A function with an operation that has no rule here, or with too many of them, is evaluated as it is.
+A function with an operation that has no rule here, with too many of them, or with a long loop is
+evaluated as it is.
 """
 
 from __future__ import annotations
@@ -51,6 +52,10 @@ from mjx_drax.kernels.scalars.rules import MOVES, UNROLLED, known_integers
 LIMIT = 8_000
 """Scalar operations of a function, above which it is left as it is: XLA would compile for longer
 than it takes for the array operations."""
+
+LONGEST = 5
+"""Steps of a loop, above which a function is left as it is: compilers take minutes for ten physics
+steps in a row. Scalarize what is in the loop."""
 
 
 def scalarized(
@@ -239,9 +244,11 @@ class _Evaluation(Arithmetic):
     # Loops and branches that do not depend on traced numbers
 
     def scan(self, values: list[np.ndarray], params: dict[str, Any]) -> list[Any]:
-        """All steps of a scan."""
+        """All steps of a scan, one after the other."""
         n, carried = _counts(params)
         length = params["length"]
+        if length > LONGEST:
+            raise Unsupported("a long loop")
         fixed, carry, over = values[:n], values[n : n + carried], values[n + carried :]
         rows: list[Any] = [None] * length
         for i in range(length)[:: -1 if params["reverse"] else 1]:
