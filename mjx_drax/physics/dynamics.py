@@ -456,15 +456,14 @@ def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Ar
     def one(model: mjx.Model, x: Array, u: Array) -> Array:
         return one_step.step(structure.fixed_in(model), x, u)
 
-    def every(model: mjx.Model, x: Array, u: Array) -> Array:
+    def every(one: Callable[..., Array], model: mjx.Model, x: Array, u: Array) -> Array:
         return jax.lax.scan(lambda x, _: (one(model, x, u), None), x, length=substeps)[0]
 
     if has_constraints(model):  # their forces come from a loop, which stays one of arrays
-        one, model = one_step.step, structure.fixed_in(model)
-        return every(model, x, u)
+        return every(one_step.step, structure.fixed_in(model), x, u)
     if substeps > 1:  # the loop, where it stays one, is over scalar arithmetic
         one = scalarized(one, BODY_LIMIT)
-    return scalarized(every, STEP_LIMIT)(model, x, u)
+    return scalarized(partial(every, one), STEP_LIMIT)(model, x, u)
 
 
 # One trace of each, shared by all that differentiate it

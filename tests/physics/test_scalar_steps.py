@@ -61,9 +61,9 @@ def chain(links):
     )
 
 
-def task(model):
+def task(model, dt=0.01):
     model = path(model) if model in ("pendulum", "cartpole", "acrobot") else model
-    return from_mjcf(model, horizon=0.02, dt=0.01, running_residual=lambda data, u: u)
+    return from_mjcf(model, horizon=2 * dt, dt=dt, running_residual=lambda data, u: u)
 
 
 MODELS = {
@@ -112,10 +112,7 @@ def test_a_cart_pole_is_a_few_hundred_operations():
 
 
 def test_many_small_steps_are_a_loop_of_scalar_arithmetic(monkeypatch):
-    problem = from_mjcf(
-        path("cartpole"), horizon=0.2, dt=0.1, running_residual=lambda data, u: u
-    )  # ten steps of 0.01 s
-    dynamics = problem.dynamics
+    dynamics = task("cartpole", dt=0.1).dynamics
     assert dynamics.substeps == 10
     x, u = jnp.array([0.1, 0.4, -0.3, 0.2]), jnp.array([0.5])
 

@@ -82,3 +82,22 @@ def test_one_chain_alone_takes_the_same_step():
         alone = line_search.line_search(ray, jnp.ones((), bool))
         np.testing.assert_allclose(alone[0], size[i], rtol=1e-6)
         np.testing.assert_allclose(alone[1].x, knots.x[i], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("gpu", "constraint_rows", "shared"),
+    [(False, 0, True), (True, 0, False), (True, 1_000, False), (True, 3_000, True)],
+)
+def test_gpus_share_the_work_where_it_is_dear(gpu, constraint_rows, shared, monkeypatch):
+    rows, common = rays()
+    size, *_ = searched(line_search._side_by_side, rows, common)
+    kind = type(common["problem"].dynamics)
+    monkeypatch.setattr(kind, "constraint_rows", constraint_rows)
+    monkeypatch.setattr(line_search, "on_gpu", lambda: gpu)
+    seen, by_need = [], line_search._by_need
+    monkeypatch.setattr(
+        line_search, "_by_need", lambda n, *given: (seen.append(n), by_need(n, *given))[1]
+    )
+    found = searched(line_search.line_search, rows, common, jnp.ones(ROWS, bool))
+    assert (ROWS in seen) == shared
+    np.testing.assert_allclose(found[0], size, rtol=1e-6)

@@ -53,9 +53,9 @@ LIMIT = 8_000
 """Scalar operations of a function, above which it is left as it is: XLA would compile for longer
 than it takes for the array operations."""
 
-LONGEST = 5
-"""Steps of a loop, above which a function is left as it is: compilers take minutes for ten physics
-steps in a row. Scalarize what is in the loop."""
+LONGEST_LOOP = 5
+"""Steps of a loop, above which a function is left as it is: ten physics steps of a cart-pole in a
+row compiled for 96 s, as a loop of scalarized steps for 30 s."""
 
 
 def scalarized(
@@ -247,7 +247,7 @@ class _Evaluation(Arithmetic):
         """All steps of a scan, one after the other."""
         n, carried = _counts(params)
         length = params["length"]
-        if length > LONGEST:
+        if length > LONGEST_LOOP:
             raise Unsupported("a long loop")
         fixed, carry, over = values[:n], values[n : n + carried], values[n + carried :]
         rows: list[Any] = [None] * length
