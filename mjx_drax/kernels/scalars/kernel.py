@@ -1,29 +1,35 @@
-"""Programs of scalars (see `scalarize`) at every row of a batch as one GPU kernel.
+"""Programs of scalars (see `scalarize`) at every row of a batch as one kernel.
 
 XLA computes every entry of a small matrix by itself, with all that it depends on: what the 20
-entries of a Jacobian share is computed, and compiled, 20 times. Here the thread of a row computes
-it once, in registers, and writes all entries.
+entries of a Jacobian share is computed, and compiled, 20 times. Here a row computes it once and
+writes all entries: on a GPU in a thread of its own, on a CPU in a loop over rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
-from mjx_drax.kernels.batching import merged_vmaps, padded, thread_for_each_row
+from mjx_drax.kernels.batching import merged_vmaps, on_gpu, padded, thread_for_each_row
 
 THREADS = 64
 """Rows that a block of threads works on: two warps."""
 
+PART = 1_000
+"""Operations of a program that a CPU's compiler gets at once: it needs more than twice as long for
+twice as many, and spills what it cannot keep in registers."""
+
 
 def vmapped_as_kernel(program: ClosedJaxpr) -> Callable[..., Array]:
-    """A program of scalars as a function of arrays of them, whose vmap is a kernel on GPUs.
+    """A program of scalars as a function of arrays of them, whose vmap is a kernel.
 
     It takes the arrays whose entries, in their order, are the program's inputs, and gives the
     program's outputs as one vector.
@@ -34,6 +40,8 @@ def vmapped_as_kernel(program: ClosedJaxpr) -> Callable[..., Array]:
         return jnp.stack(jaxpr_as_fun(program)(*entries))
 
     def all_rows(has_rows: tuple[bool, ...], *inputs: Array) -> Array:
+        if not on_gpu():
+            return by_windows(program, has_rows, *inputs)
         plain = jax.vmap(one, [0 if own else None for own in has_rows])
         kernel = partial(at_all_rows, program, has_rows)
         return lax.platform_dependent(*inputs, cuda=kernel, default=plain)
@@ -72,3 +80,95 @@ def at_all_rows(
     shape = (len(program.out_avals),)
     out = thread_for_each_row(body, THREADS, shape, [packed], [shared], interpret)
     return out[:, :rows].T
+
+
+def by_windows(program: ClosedJaxpr, has_rows: Sequence[bool], *inputs: Array) -> Array:
+    """`at_all_rows` for CPUs, (rows, outputs), one loop over all rows for each part of the program.
+
+    XLA has no operation "compute these numbers for every row". But its reduction of windows takes
+    a program of scalars, and compiles it as it stands: with one entry a window, that program's
+    arguments are the initial values, here the numbers that are common to all rows, and the entries.
+    """
+    jaxpr, rows = program.jaxpr, next(len(a) for a, b in zip(inputs, has_rows, strict=True) if b)
+    common: dict[Any, Any] = dict(zip(jaxpr.constvars, program.consts, strict=True))
+    own: dict[Any, Any] = {}
+    places = iter(jaxpr.invars)
+    for array, is_own in zip(inputs, has_rows, strict=True):
+        numbers = array.reshape(rows, -1).T if is_own else jnp.ravel(array)
+        known = own if is_own else common
+        known.update({place: number for number, place in zip(numbers, places, strict=False)})
+    for part in _parts(jaxpr, PART):
+        own.update(part.at_all_rows(rows, own, common))
+    columns = [own[v] if v in own else jnp.full(rows, common[v]) for v in jaxpr.outvars]
+    return jnp.stack(columns, axis=1)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some operations of a program of scalars, in their order.
+
+    Attributes:
+        operations: what it does.
+        reads: numbers that it needs, which come before it.
+        writes: its own numbers that come to use after it.
+    """
+
+    operations: list[JaxprEqn]
+    reads: list[Any]
+    writes: list[Any]
+
+    def at_all_rows(
+        self, rows: int, own: dict[Any, Any], common: dict[Any, Any]
+    ) -> dict[Any, Array]:
+        """What it writes, (rows,) each, from numbers of rows (rows,) and common ones ()."""
+        of_row, of_all, out = (
+            _by_dtype(part)
+            for part in (
+                [v for v in self.reads if v in own],
+                [v for v in self.reads if v not in own],
+                self.writes,
+            )
+        )
+        operands, starts, places = [], [], []
+        for dtype in dict.fromkeys([*of_row, *of_all, *out]):
+            each = [kind.get(dtype, []) for kind in (of_row, of_all, out)]
+            for place in zip_longest(*each):
+                a, b, _ = place
+                operands.append(jnp.zeros(rows, dtype) if a is None else own[a])
+                starts.append(jnp.zeros((), dtype) if b is None else jnp.asarray(common[b]))
+                places.append(place)
+
+        def computed(initial: Sequence[Any], entries: Sequence[Any]) -> tuple[Any, ...]:
+            values: dict[Any, Any] = {}
+            for (a, b, _), start, entry in zip(places, initial, entries, strict=True):
+                values |= {a: entry, b: start}
+            for operation in self.operations:
+                inputs = [v.val if isinstance(v, Literal) else values[v] for v in operation.invars]
+                out = operation.primitive.bind(*inputs, **operation.params)
+                several = operation.primitive.multiple_results
+                values.update(zip(operation.outvars, out if several else [out], strict=True))
+            results = zip(places, initial, strict=True)
+            return tuple(start if c is None else values[c] for (*_, c), start in results)
+
+        found = lax.reduce_window(tuple(operands), tuple(starts), computed, (1,), (1,), "VALID")
+        return {c: column for (*_, c), column in zip(places, found, strict=True) if c is not None}
+
+
+def _by_dtype(variables: Sequence[Any]) -> dict[Any, list[Any]]:
+    found: dict[Any, list[Any]] = {}
+    for variable in variables:
+        found.setdefault(variable.aval.dtype, []).append(variable)
+    return found
+
+
+def _parts(jaxpr: Jaxpr, size: int) -> Iterator[_Part]:
+    """The program, cut after every `size` operations."""
+    last = {v: n for n, e in enumerate(jaxpr.eqns) for v in e.invars if not isinstance(v, Literal)}
+    last.update({v: len(jaxpr.eqns) for v in jaxpr.outvars})
+    for start in range(0, len(jaxpr.eqns), size):
+        operations = jaxpr.eqns[start : start + size]
+        end = start + len(operations)
+        inside = {v: None for e in operations for v in e.outvars}
+        used = (v for e in operations for v in e.invars if not isinstance(v, Literal))
+        reads = [v for v in dict.fromkeys(used) if v not in inside]
+        yield _Part(operations, reads, [v for v in inside if last.get(v, -1) >= end])

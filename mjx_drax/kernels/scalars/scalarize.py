@@ -23,9 +23,11 @@ from functools import wraps
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from mjx_drax.kernels.batching import of_one_precision, on_gpu
 from mjx_drax.kernels.pruning import needed_program, without_unused
@@ -74,7 +76,7 @@ def scalarized(
     @wraps(function)
     def in_scalars(*arguments: Any) -> Any:
         program, inputs, tree = needed_program(function, arguments)
-        evaluate = as_kernel if outermost and on_gpu() else in_operations
+        evaluate = as_kernel if outermost else in_operations
         try:
             outputs = evaluate(limit, program, inputs)
         except (Unsupported, TypeError):  # types: as in `pruned`
@@ -102,7 +104,7 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
     """
     numbers = [*program.consts, *inputs]
     traced = [isinstance(number, jax.core.Tracer) for number in numbers]
-    read = [number for number, is_traced in zip(numbers, traced, strict=True) if is_traced]
+    given = [number for number, is_traced in zip(numbers, traced, strict=True) if is_traced]
 
     found: dict[Any, Scalar] = {}  # distinct entries of the outputs
     keys: list[Any] = []  # of all entries
@@ -111,7 +113,8 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
         left, values = iter(entries), list(numbers)
         for i, number in enumerate(numbers):
             if traced[i]:
-                values[i] = array_of([next(left) for _ in range(number.size)], number.shape)
+                each = array_of([next(left) for _ in range(number.size)], number.shape)
+                values[i] = as_numbers(each, number.dtype)
         consts, arguments = values[: len(program.consts)], values[len(program.consts) :]
         outputs = _Evaluation(limit).outputs(program, consts, arguments)
         scalars = [scalar for output in outputs for scalar in entries_of(output)]
@@ -119,15 +122,18 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
         found.update(zip(keys, scalars, strict=True))
         return [scalar for scalar in found.values() if not is_known(scalar)]
 
-    entries = sum(number.size for number in read)
-    avals: list[Any] = [*(number.aval for number in read), *program.out_avals]
-    if not read or not of_one_precision(avals) or entries > limit:
-        return in_operations(limit, program, inputs)
-    dtype = avals[0].dtype
-    scalars = jax.make_jaxpr(in_scalars)(*[jax.ShapeDtypeStruct((), dtype)] * entries)
+    if not all(is_numeric(number.dtype) for number in given):
+        raise Unsupported("keys")
+    entries = [jax.ShapeDtypeStruct((), a.dtype) for a in given for _ in range(a.size)]
+    scalars, used = _used(jax.make_jaxpr(in_scalars)(*entries))
+    avals = [*scalars.in_avals, *scalars.out_avals]
     plain = all(equation.primitive.name in IN_KERNELS for equation in scalars.eqns)
-    if not (plain and scalars.out_avals):
+    if not (any(used) and scalars.out_avals and plain and of_one_precision([*avals, *program.out_avals])):
         return in_operations(limit, program, inputs)
+    ends = np.cumsum([number.size for number in given])[:-1]
+    places = map(np.flatnonzero, np.split(used, ends))
+    read = [jnp.ravel(a)[i] for a, i in zip(given, places, strict=True) if i.size]
+    dtype = avals[0].dtype
 
     shapes = [aval.shape for aval in program.out_avals]
     sizes = [math.prod(shape) for shape in shapes]
@@ -137,6 +143,13 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
     distinct = lax.concatenate([written, np.array([*known.values()], dtype)], 0)
     parts = lax.split(distinct[np.array([places[key] for key in keys])], sizes)
     return [lax.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def _used(program: ClosedJaxpr) -> tuple[ClosedJaxpr, np.ndarray]:
+    """The program without what no output needs, and which of its inputs are left."""
+    every = [True] * len(program.jaxpr.outvars)
+    jaxpr, used = dce_jaxpr(program.jaxpr, every)
+    return program.replace(jaxpr=jaxpr), np.array(used, bool)
 
 
 def _joined(value: np.ndarray) -> Any:
