@@ -453,17 +453,19 @@ def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.
 
 
 def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Array) -> Array:
-    def one(model: mjx.Model, x: Array, u: Array) -> Array:
-        return one_step.step(structure.fixed_in(model), x, u)
+    def one(model: mjx.Model, x: Array, u: Array, by_operations: bool = False) -> Array:
+        return one_step.step(structure.fixed_in(model), x, u, by_operations)
 
     def every(one: Callable[..., Array], model: mjx.Model, x: Array, u: Array) -> Array:
         return jax.lax.scan(lambda x, _: (one(model, x, u), None), x, length=substeps)[0]
 
     if has_constraints(model):  # their forces come from a loop, which stays one of arrays
         return every(one_step.step, structure.fixed_in(model), x, u)
-    if substeps > 1:  # the loop, where it stays one, is over scalar arithmetic
-        one = scalarized(one, BODY_LIMIT)
-    return scalarized(partial(every, one), STEP_LIMIT)(model, x, u)
+    body = partial(one, by_operations=True)
+    # Where all steps are too much, the loop stays one, if possible of scalar arithmetic
+    lean = scalarized(body, BODY_LIMIT, otherwise=one) if substeps > 1 else one
+    whole = scalarized(partial(every, body), STEP_LIMIT, otherwise=partial(every, lean))
+    return whole(model, x, u)
 
 
 # One trace of each, shared by all that differentiate it

@@ -19,6 +19,7 @@ Six things differ from `mjx.step`. Only the last two change values:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -36,7 +37,7 @@ from mjx_drax.kernels.constraint_solver import (
     pulled,
 )
 from mjx_drax.kernels.elliptic_cones import Cones
-from mjx_drax.kernels.linalg import solve, solve_positive, symmetric
+from mjx_drax.kernels.linalg import cholesky, solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import internal, mjx, with_internal
 from mjx_drax.physics.contacts.collision import collision, make_data
@@ -205,33 +206,40 @@ def _constrained(
     return with_internal(data, efc_force=_forces(model, data, qacc)[0])
 
 
-def step(model: mjx.Model, x: Array, u: Array) -> Array:
-    """The state (nx,) one timestep after x (nx,) under the control u (nu,)."""
+def step(model: mjx.Model, x: Array, u: Array, by_operations: bool = False) -> Array:
+    """The state (nx,) one timestep after x (nx,) under the control u (nu,).
+
+    Args:
+        model: the model.
+        x: state.
+        u: control.
+        by_operations: whether it is differentiated operation by operation, not in closed form:
+            where scalar arithmetic leaves out what is zero. Not for models with constraints.
+    """
     joints, h = Joints.of(model), model.opt.timestep
+    rates = _rates_of if by_operations else _rates
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return _runge_kutta(model, joints, x, u)
-    qacc, change = jnp.split(_rates(model, x, u), [model.nv])
+        return _runge_kutta(model, joints, rates, x, u)
+    qacc, change = jnp.split(rates(model, x, u), [model.nv])
     dv = h * qacc
     velocity = x[model.nq : model.nq + model.nv] + dv
     return joints.integrate(x, jnp.concatenate([h * velocity, dv, change]))
 
 
-def _rates(model: mjx.Model, x: Array, u: Array) -> Array:
-    """The acceleration that is integrated (nv,), and rates of activations; see `_derivatives`."""
-    return (_with_own_derivative if has_constraints(model) else _rates_of)(model, x, u)
-
-
 def _rates_of(model: mjx.Model, x: Array, u: Array, derivatives: bool = True) -> Array:
-    """`_rates`, differentiated operation by operation, if at all."""
+    """The acceleration that is integrated (nv,), and rates of activations.
+
+    Differentiated operation by operation, if at all.
+    """
     data = _smooth(model, kinematics(model, data_at(model, x, u)))
     data = _constrained(model, data, derivatives=derivatives)
     return jnp.concatenate([_implicit(model, data), _activation_rates(model, data)])
 
 
-_with_own_derivative = jax.custom_jvp(partial(_rates_of, derivatives=False))
+_rates = jax.custom_jvp(partial(_rates_of, derivatives=False))
 
 
-@partial(_with_own_derivative.defjvp, symbolic_zeros=True)
+@partial(_rates.defjvp, symbolic_zeros=True)
 def _rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Where numbers of the model change too, by the operations; else by `_derivatives`.
 
@@ -267,7 +275,9 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     """
     start = kinematics(model, data_at(model, x, u))
     data = _smooth(model, start)
-    placed, solution = data, _solution(model, data)
+    placed, held = data, has_constraints(model)
+    free = data.qacc_smooth, cholesky(internal(data).M)
+    solution = _solution(model, data) if held else free
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
@@ -277,8 +287,9 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
             at = _smooth(model, start.replace(**changed))
         else:  # nothing has moved
             at = _driven(model, placed.replace(**changed))
-        pull = _forces(model, at, a)[1]
-        pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied + pull
+        pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied
+        if held:
+            pushed += _forces(model, at, a)[1]
         left, later = _tendon_bias(model, at, a) - pushed, data.qvel[:0]
         if not explicit:
             later = _tendon_inertia_times(model, at, b - a) + _damping_times(model, at, b)
@@ -461,14 +472,16 @@ def _force_slopes(model: mjx.Model, data: mjx.Data) -> Array:
     return jnp.where(inside | ~model.actuator_forcelimited.astype(bool), slope, 0.0)
 
 
-def _runge_kutta(model: mjx.Model, joints: Joints, x: Array, u: Array) -> Array:
+def _runge_kutta(
+    model: mjx.Model, joints: Joints, rates: Callable[..., Array], x: Array, u: Array
+) -> Array:
     """MuJoCo's Runge-Kutta step of order 4."""
     h = model.opt.timestep
 
     def stage(carry: tuple[Array, Array], entry: Array) -> tuple[tuple[Array, Array], None]:
         rate, total = carry
         x_at = joints.integrate(x, h * entry[0] * rate)
-        rate = jnp.concatenate([x_at[model.nq : model.nq + model.nv], _rates(model, x_at, u)])
+        rate = jnp.concatenate([x_at[model.nq : model.nq + model.nv], rates(model, x_at, u)])
         return (rate, total + entry[1] * rate), None
 
     zero = jnp.zeros(2 * model.nv + model.na, x.dtype)

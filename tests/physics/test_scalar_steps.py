@@ -1,6 +1,7 @@
 """Steps of MJX in scalar arithmetic: the same numbers, few operations, constants may change."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ from mjx_drax import from_mjcf
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.models import path
 from mjx_drax.physics import dynamics as mjx_dynamics
+from mjx_drax.physics import step as one_step
+from mjx_drax.physics.step import step
 from mjx_drax.problem.differentiators import Autodiff, InScalars
 from mjx_drax.problem.trajectory import Knot
 
@@ -91,7 +94,7 @@ def test_steps_and_jacobians_are_those_of_mjx(model, monkeypatch):
             return jax.jit(lambda dynamics, z: derivatives(by, dynamics, z))(dynamics, z)
 
         seen = all_of_it(InScalars(Autodiff()), z, dynamics)
-        monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, limit: function)
+        monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, *_, **__: function)
         jax.clear_caches()
         close(seen, all_of_it(Autodiff(), z, dynamics), 1e-12)
 
@@ -105,10 +108,45 @@ def test_a_cart_pole_is_a_few_hundred_operations():
             lambda dz: dynamics.step(x + dz[:4], u + dz[4:]), 5, jax.random.key(0)
         )
 
-    equations = jax.make_jaxpr(pruned(f))(dynamics, x, u).eqns
-    moves = ("slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim")
+    around = jax.make_jaxpr(pruned(f))(dynamics, x, u).eqns
+    (kernel,) = (e for e in around if e.primitive.name == "custom_vmap_call")
+    equations = kernel.params["call"].eqns
+    moves = ("slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim", "stack")
     assert sum(e.primitive.name not in moves for e in equations) < 600
     assert all(e.outvars[0].aval.size == 1 or e.primitive.name in moves for e in equations)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_derivatives_in_closed_form_are_those_of_the_operations(integrator):
+    xml = EVERYTHING.replace("<option", f'<option integrator="{integrator}"')
+    with jax.enable_x64(True):
+        dynamics = task(xml).dynamics
+        z = jnp.asarray(RNG.uniform(-1.0, 1.0, dynamics.nx + dynamics.nu))
+
+        @partial(jax.jit, static_argnums=0)
+        def jacobian(by_operations, model, z):
+            def f(z):
+                return step(model, *jnp.split(z, [dynamics.nx]), by_operations)
+
+            return jax.jacfwd(f)(z)
+
+        seen, wanted = (jacobian(by, dynamics.model, z) for by in (False, True))
+        close(seen, wanted, 1e-10)
+
+
+def test_more_operations_than_scalars_are_for_are_derived_in_closed_form(monkeypatch):
+    """A chain of rods, of whose step the limit makes one of arrays."""
+    dynamics, asked = task(MODELS["chain"]).dynamics, []
+    closed = one_step._derivatives
+    monkeypatch.setattr(one_step, "_derivatives", lambda *a: asked.append(a) or closed(*a))
+    z = jnp.asarray(RNG.uniform(-1.0, 1.0, 12), jnp.float32)
+    found = []
+    for limit in (mjx_dynamics.STEP_LIMIT, 100):
+        monkeypatch.setattr(mjx_dynamics, "STEP_LIMIT", limit)
+        jax.clear_caches()
+        found.append(jax.jit(jax.jacfwd(lambda z: dynamics.step(z[:10], z[10:])))(z))
+        assert bool(asked) is (limit == 100)
+    close(*found, 1e-4)
 
 
 def test_many_small_steps_are_a_loop_of_scalar_arithmetic(monkeypatch):
@@ -128,7 +166,7 @@ def test_many_small_steps_are_a_loop_of_scalar_arithmetic(monkeypatch):
     assert {"sin", "cos"} <= names
     assert not names & {"dot_general", "gather", "scatter", "cholesky", "while"}
     seen = jax.jit(derivatives)(dynamics, x, u)
-    monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, limit: function)
+    monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, *_, **__: function)
     jax.clear_caches()
     close(seen, jax.jit(derivatives)(dynamics, x, u), 1e-4)
 

@@ -29,7 +29,7 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from mjx_drax.kernels.batching import of_one_precision, on_gpu
+from mjx_drax.kernels.batching import of_one_precision
 from mjx_drax.kernels.pruning import needed_program, without_unused
 from mjx_drax.kernels.scalars.arithmetic import (
     ELEMENTWISE,
@@ -61,16 +61,19 @@ row compiled for 96 s, as a loop of scalarized steps for 30 s."""
 
 
 def scalarized(
-    function: Callable[..., Any], limit: int = LIMIT, outermost: bool = False
+    function: Callable[..., Any],
+    limit: int = LIMIT,
+    outermost: bool = False,
+    otherwise: Callable[..., Any] | None = None,
 ) -> Callable[..., Any]:
     """The same function of pytrees of arrays, in scalar arithmetic where that is possible.
 
     With more than `limit` operations (each entry of a traced array that is read counts as one) it
-    stays as it is. Arrays that the function closes over and that are not traced are known numbers,
+    stays as it is, or is `otherwise`, if given, which computes the same. Arrays that the function closes over and that are not traced are known numbers,
     whose zeros and ones are used. Arguments are not. Functions with their own derivative rule
     (custom_jvp, custom_vjp) are not opened, because the result may be differentiated:
-    differentiate first. If it is `outermost`, which nobody differentiates, GPUs compute it for all
-    rows of a batch by one kernel.
+    differentiate first. If it is `outermost`, which nobody differentiates, one kernel computes it
+    for all rows of a batch.
     """
 
     @wraps(function)
@@ -80,6 +83,8 @@ def scalarized(
         try:
             outputs = evaluate(limit, program, inputs)
         except (Unsupported, TypeError):  # types: as in `pruned`
+            if otherwise is not None:
+                return otherwise(*arguments)
             outputs = unchanged(program, inputs)
         return jax.tree.unflatten(tree, outputs)
 

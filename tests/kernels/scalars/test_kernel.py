@@ -1,11 +1,12 @@
-"""The kernel of a program of scalars, interpreted, against vmap of the same function."""
+"""Kernels of a program of scalars, those of GPUs interpreted, against vmap of the function."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax.kernels.scalars.kernel import THREADS, at_all_rows, vmapped_as_kernel
+from mjx_drax.kernels.scalars import kernel
+from mjx_drax.kernels.scalars.kernel import THREADS, at_all_rows, by_windows, vmapped_as_kernel
 
 RNG = np.random.default_rng(0)
 
@@ -16,10 +17,11 @@ def function(x, y, z):
     return jnp.append(jnp.outer(lean, x), lean.sum() / z[1])
 
 
-def of_entries(*entries):
+def of_entries(a, b, c, d, e, f):
     """`function` as a kernel takes it."""
-    x, y, z = (jnp.stack(entries[i : i + 2]) for i in (0, 2, 4))
-    return list(function(x, y, z))
+    larger = jax.lax.select(b > 1.0, b, jnp.exp(e))
+    lean = [jnp.sin(a * y) + f * larger for y in (c, d)]
+    return [entry * x for entry in lean for x in (a, b)] + [(lean[0] + lean[1]) / f]
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,31 @@ def test_the_kernel_computes_every_row(program, rows, has_rows):
     seen = at_all_rows(program, has_rows, *inputs, interpret=True)
     wanted = jax.vmap(function, [0 if own else None for own in has_rows])(*inputs)
     np.testing.assert_allclose(seen, wanted, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1_000, 7, 1])  # operations of a part: all of them, some, one
+@pytest.mark.parametrize("has_rows", [(False, True, False), (True, False, True), (True,) * 3])
+def test_a_cpu_computes_every_row_in_parts(program, has_rows, size, monkeypatch):
+    """Of booleans too, which parts of one operation give to the next."""
+    monkeypatch.setattr(kernel, "PART", size)
+    inputs = [RNG.uniform(0.5, 2.0, (9,) * own + (2,)).astype(np.float32) for own in has_rows]
+    seen = jax.jit(lambda *inputs: by_windows(program, has_rows, *inputs))(*inputs)
+    wanted = jax.vmap(function, [0 if own else None for own in has_rows])(*inputs)
+    np.testing.assert_allclose(seen, wanted, rtol=1e-6)
+
+
+def test_a_cpu_is_given_each_operation_once(program):
+    """And not what an entry depends on once for each entry, as by fusion."""
+    x = np.ones((9, 6), np.float32)
+    compiled = jax.jit(jax.vmap(lambda x: vmapped_as_kernel(program)(x))).lower(x).compile()
+    assert compiled.as_text().count("exponential(") == 1
+
+
+def test_outputs_may_be_inputs():
+    same = jax.make_jaxpr(lambda a, b, c: [a, b, a * c])(*[jnp.ones(())] * 3)
+    a, b, c = np.arange(3.0, dtype=np.float32), np.float32(5.0), np.full(3, 2.0, np.float32)
+    seen = by_windows(same, (True, False, True), a, b, c)
+    np.testing.assert_array_equal(seen, [[0, 5, 0], [1, 5, 2], [2, 5, 4]])
 
 
 def test_without_a_gpu_its_vmap_is_that_of_the_program(program):

@@ -255,6 +255,24 @@ def test_kernels_serve_float64_and_no_mixture(strictly, on_gpu):
             assert ("custom_vmap" in program) is served
 
 
+def test_kernels_read_only_what_is_used(strictly, monkeypatch):
+    """Not integers that a choice leaves out, which would keep a model's step out of kernels."""
+    read, as_kernel = [], scalarize.vmapped_as_kernel
+
+    def noted(program):
+        read.append(len(program.in_avals))
+        return as_kernel(program)
+
+    def chosen(x, whole):
+        return 2.0 * x[1] + jax.lax.select(np.array([True, True]), np.array([3, 4]), whole).sum()
+
+    monkeypatch.setattr(scalarize, "vmapped_as_kernel", noted)
+    over = jax.jit(jax.vmap(scalarized(chosen, outermost=True), (0, None)))
+    x = A.astype(np.float32)
+    close(over(x, jnp.arange(2)), 2.0 * x[:, 1] + 7, 1e-6)
+    assert read == [1]
+
+
 def test_kernels_write_each_number_once_and_none_that_is_known(strictly, on_gpu, monkeypatch):
     written, as_kernel = set(), scalarize.vmapped_as_kernel
 
