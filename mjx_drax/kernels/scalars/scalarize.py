@@ -69,11 +69,11 @@ def scalarized(
     """The same function of pytrees of arrays, in scalar arithmetic where that is possible.
 
     With more than `limit` operations (each entry of a traced array that is read counts as one) it
-    stays as it is, or is `otherwise`, if given, which computes the same. Arrays that the function closes over and that are not traced are known numbers,
-    whose zeros and ones are used. Arguments are not. Functions with their own derivative rule
-    (custom_jvp, custom_vjp) are not opened, because the result may be differentiated:
-    differentiate first. If it is `outermost`, which nobody differentiates, one kernel computes it
-    for all rows of a batch.
+    stays as it is, or is `otherwise`, if given, which computes the same. Arrays that the function
+    closes over and that are not traced are known numbers, whose zeros and ones are used. Arguments
+    are not. Functions with their own derivative rule (custom_jvp, custom_vjp) are not opened,
+    because the result may be differentiated: differentiate first. If it is `outermost`, which
+    nobody differentiates, one kernel computes it for all rows of a batch.
     """
 
     @wraps(function)
@@ -104,12 +104,19 @@ def in_operations(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> li
 def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
     """Its outputs by scalar operations that one kernel does for all rows of a batch.
 
-    The kernel writes each number once, and none that is known, as most entries of large Jacobians
-    are: its compilation takes long where it writes many.
+    It reads only what it uses: not the integers of a model, which are known. It writes each number
+    once, and none that is known, as most entries of large Jacobians are: its compilation takes long
+    where it writes many.
     """
     numbers = [*program.consts, *inputs]
-    traced = [isinstance(number, jax.core.Tracer) for number in numbers]
+    jaxpr = program.jaxpr
+    atoms = [*jaxpr.outvars, *(v for e in jaxpr.eqns for v in e.invars)]
+    needed = {v for v in atoms if not isinstance(v, Literal)}
+    places = zip([*jaxpr.constvars, *jaxpr.invars], numbers, strict=True)
+    traced = [v in needed and isinstance(number, jax.core.Tracer) for v, number in places]
     given = [number for number, is_traced in zip(numbers, traced, strict=True) if is_traced]
+    if sum(number.size for number in given) > limit:
+        return in_operations(limit, program, inputs)
 
     found: dict[Any, Scalar] = {}  # distinct entries of the outputs
     keys: list[Any] = []  # of all entries
@@ -131,22 +138,22 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
         raise Unsupported("keys")
     entries = [jax.ShapeDtypeStruct((), a.dtype) for a in given for _ in range(a.size)]
     scalars, used = _used(jax.make_jaxpr(in_scalars)(*entries))
-    avals = [*scalars.in_avals, *scalars.out_avals]
     plain = all(equation.primitive.name in IN_KERNELS for equation in scalars.eqns)
-    if not (any(used) and scalars.out_avals and plain and of_one_precision([*avals, *program.out_avals])):
+    avals: list[Any] = [*scalars.in_avals, *program.out_avals]
+    if not (used.any() and scalars.out_avals and plain and of_one_precision(avals)):
         return in_operations(limit, program, inputs)
     ends = np.cumsum([number.size for number in given])[:-1]
-    places = map(np.flatnonzero, np.split(used, ends))
-    read = [jnp.ravel(a)[i] for a, i in zip(given, places, strict=True) if i.size]
+    of_each = zip(given, map(np.flatnonzero, np.split(used, ends)), strict=True)
+    read = [jnp.ravel(array)[which] for array, which in of_each if which.size]
     dtype = avals[0].dtype
 
     shapes = [aval.shape for aval in program.out_avals]
     sizes = [math.prod(shape) for shape in shapes]
     known = {key: scalar for key, scalar in found.items() if is_known(scalar)}
-    places = {key: i for i, key in enumerate([*(k for k in found if k not in known), *known])}
+    order = {key: i for i, key in enumerate([*(k for k in found if k not in known), *known])}
     written = vmapped_as_kernel(scalars)(*read)
     distinct = lax.concatenate([written, np.array([*known.values()], dtype)], 0)
-    parts = lax.split(distinct[np.array([places[key] for key in keys])], sizes)
+    parts = lax.split(distinct[np.array([order[key] for key in keys])], sizes)
     return [lax.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
 
 

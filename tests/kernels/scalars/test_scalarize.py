@@ -273,6 +273,15 @@ def test_kernels_read_only_what_is_used(strictly, monkeypatch):
     assert read == [1]
 
 
+def test_kernels_may_return_what_they_are_given(strictly):
+    def function(x, y):
+        return x, y[0] * x, y
+
+    x, y = A.astype(np.float32), np.float32([3.0, 4.0])
+    over = jax.jit(jax.vmap(scalarized(function, outermost=True), (0, None)))
+    close(over(x, y), (x, 3.0 * x, np.tile(y, (3, 1))), 1e-6)
+
+
 def test_kernels_write_each_number_once_and_none_that_is_known(strictly, on_gpu, monkeypatch):
     written, as_kernel = set(), scalarize.vmapped_as_kernel
 
