@@ -41,5 +41,15 @@ def needed_program(
 
 def without_unused(program: ClosedJaxpr) -> ClosedJaxpr:
     """The program without operations that no output needs."""
+    return _pruned(program, keep_inputs=True)[0]
+
+
+def without_unused_inputs(program: ClosedJaxpr) -> tuple[ClosedJaxpr, list[bool]]:
+    """The same without inputs that no output needs, too; and which inputs are left."""
+    return _pruned(program, keep_inputs=False)
+
+
+def _pruned(program: ClosedJaxpr, keep_inputs: bool) -> tuple[ClosedJaxpr, list[bool]]:
     every = [True] * len(program.jaxpr.outvars)
-    return program.replace(jaxpr=dce_jaxpr(program.jaxpr, every, instantiate=True)[0])
+    jaxpr, used = dce_jaxpr(program.jaxpr, every, instantiate=keep_inputs)
+    return program.replace(jaxpr=jaxpr), used

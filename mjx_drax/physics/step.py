@@ -237,6 +237,7 @@ def _rates_of(model: mjx.Model, x: Array, u: Array, derivatives: bool = True) ->
 
 
 _rates = jax.custom_jvp(partial(_rates_of, derivatives=False))
+"""`_rates_of`, differentiated in closed form: see `_derivatives`."""
 
 
 @partial(_rates.defjvp, symbolic_zeros=True)
@@ -276,8 +277,8 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     start = kinematics(model, data_at(model, x, u))
     data = _smooth(model, start)
     placed, held = data, has_constraints(model)
-    free = data.qacc_smooth, cholesky(internal(data).M)
-    solution = _solution(model, data) if held else free
+    M = internal(data).M
+    solution = _solution(model, data) if held else (data.qacc_smooth, cholesky(M))
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
@@ -320,7 +321,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     d = -solve(solution[1], left)
     if not explicit:
         later = later.at[:, : model.nv].add(more_by_q)
-        d = _solve_implicit(model, data, internal(data).M @ d - later)
+        d = _solve_implicit(model, data, M @ d - later)
     value = jnp.concatenate([b, _activation_rates(model, data)])
     return value, jnp.concatenate([d, rates])
 

@@ -10,6 +10,7 @@ import pytest
 
 from mjx_drax import from_mjcf
 from mjx_drax.kernels.pruning import pruned
+from mjx_drax.kernels.scalars import scalarize
 from mjx_drax.models import path
 from mjx_drax.physics import dynamics as mjx_dynamics
 from mjx_drax.physics import step as one_step
@@ -114,6 +115,29 @@ def test_a_cart_pole_is_a_few_hundred_operations():
     moves = ("slice", "squeeze", "reshape", "concatenate", "broadcast_in_dim", "stack")
     assert sum(e.primitive.name not in moves for e in equations) < 600
     assert all(e.outvars[0].aval.size == 1 or e.primitive.name in moves for e in equations)
+
+
+def test_a_cpu_is_given_each_operation_once(monkeypatch):
+    """And not what entries of a Jacobian share once for each of them, as where XLA fuses."""
+    dynamics, z = task("cartpole").dynamics, jnp.ones((9, 5))
+    programs, as_kernel = [], scalarize.vmapped_as_kernel
+
+    def jacobian(z):
+        def step(dz):
+            return dynamics.step(*jnp.split(z + dz, [4]))
+
+        return InScalars(Autodiff()).jacobian(step, 5, jax.random.key(0))
+
+    monkeypatch.setattr(
+        scalarize,
+        "vmapped_as_kernel",
+        lambda program: programs.append(program) or as_kernel(program),
+    )
+    compiled = jax.jit(jax.vmap(jacobian)).lower(z).compile().as_text()
+    (program,) = programs
+    products = [e for e in program.eqns if e.primitive.name == "mul"]
+    # Integer powers become products too: 150 for 142; with fusion it was 725
+    assert 100 < compiled.count(" multiply(") < 2 * len(products)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])

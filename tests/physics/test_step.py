@@ -205,7 +205,7 @@ IMPLICIT = """
 def test_implicitfast_is_the_c_engines(friction, derivatives):
     """Forces at their ends and within, tendons between trees, and a free body that turns.
 
-    With friction there are constraints, and derivatives of a step have a rule of their own.
+    With friction there are constraints; derivatives are in closed form with and without.
     """
     model = mujoco.MjModel.from_xml_string(
         IMPLICIT.replace('damping="0.1"', f'damping="0.1" frictionloss="{friction}"')

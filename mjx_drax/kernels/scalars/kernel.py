@@ -99,7 +99,7 @@ def by_windows(program: ClosedJaxpr, has_rows: Sequence[bool], *inputs: Array) -
         known.update({place: number for number, place in zip(numbers, places, strict=False)})
     for part in _parts(jaxpr, PART):
         own.update(part.at_all_rows(rows, own, common))
-    columns = [own[v] if v in own else jnp.full(rows, common[v]) for v in _variables(jaxpr.outvars)]
+    columns = [own[v] if v in own else jnp.full(rows, common[v]) for v in jaxpr.outvars]
     return jnp.stack(columns, axis=1)
 
 

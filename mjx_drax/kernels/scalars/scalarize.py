@@ -27,10 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
-from jax.interpreters.partial_eval import dce_jaxpr
 
 from mjx_drax.kernels.batching import of_one_precision
-from mjx_drax.kernels.pruning import needed_program, without_unused
+from mjx_drax.kernels.pruning import needed_program, without_unused, without_unused_inputs
 from mjx_drax.kernels.scalars.arithmetic import (
     ELEMENTWISE,
     IN_KERNELS,
@@ -137,10 +136,10 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
     if not all(is_numeric(number.dtype) for number in given):
         raise Unsupported("keys")
     entries = [jax.ShapeDtypeStruct((), a.dtype) for a in given for _ in range(a.size)]
-    scalars, used = _used(jax.make_jaxpr(in_scalars)(*entries))
+    scalars, used = without_unused_inputs(jax.make_jaxpr(in_scalars)(*entries))
     plain = all(equation.primitive.name in IN_KERNELS for equation in scalars.eqns)
     avals: list[Any] = [*scalars.in_avals, *program.out_avals]
-    if not (used.any() and scalars.out_avals and plain and of_one_precision(avals)):
+    if not (any(used) and scalars.out_avals and plain and of_one_precision(avals)):
         return in_operations(limit, program, inputs)
     ends = np.cumsum([number.size for number in given])[:-1]
     of_each = zip(given, map(np.flatnonzero, np.split(used, ends)), strict=True)
@@ -155,13 +154,6 @@ def as_kernel(limit: int, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[A
     distinct = lax.concatenate([written, np.array([*known.values()], dtype)], 0)
     parts = lax.split(distinct[np.array([order[key] for key in keys])], sizes)
     return [lax.reshape(part, shape) for part, shape in zip(parts, shapes, strict=True)]
-
-
-def _used(program: ClosedJaxpr) -> tuple[ClosedJaxpr, np.ndarray]:
-    """The program without what no output needs, and which of its inputs are left."""
-    every = [True] * len(program.jaxpr.outvars)
-    jaxpr, used = dce_jaxpr(program.jaxpr, every)
-    return program.replace(jaxpr=jaxpr), np.array(used, bool)
 
 
 def _joined(value: np.ndarray) -> Any:
