@@ -26,6 +26,7 @@ from mjx_drax.kernels.batching import (
     repeated,
     thread_for_each_row,
 )
+from mjx_drax.kernels.linalg import product
 from mjx_drax.kernels.riccati_gpu import THREADS, Layout, over_stages, write
 from mjx_drax.kernels.small_matrices import Matrix, add, matmul
 
@@ -37,7 +38,7 @@ def step_by_step(F: Array, f: Array) -> Array:
     """`affine_recursion` by a loop over k."""
 
     def step(x: Array, stage: tuple[Array, Array]) -> tuple[Array, Array]:
-        x = stage[0] @ x + stage[1]
+        x = product(stage[0], x) + stage[1]
         return x, x
 
     return jax.lax.scan(step, jnp.zeros_like(f[0]), (F, f))[1]
@@ -100,11 +101,11 @@ def by_blocks(F: Array, f: Array, interpret: bool = False) -> Array:
     chains, K, n, m = f.shape
     N, M = riccati_blocks.tile(n), riccati_blocks.tile(m)
     precision = lax.Precision.HIGHEST if interpret else riccati_blocks.SPLIT
-    product = partial(riccati_blocks.product, precision=precision)
+    times = partial(riccati_blocks.product, precision=precision)
 
     def body(F_ref: Any, f_ref: Any, x_ref: Any) -> None:
         def stage(k: Array, x: Array) -> Array:
-            x = product(F_ref[0, k], x) + f_ref[0, k]
+            x = times(F_ref[0, k], x) + f_ref[0, k]
             x_ref[0, k] = x
             return x
 

@@ -36,7 +36,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.kernels.linalg import cholesky, solve, solve_upper, symmetric
+from mjx_drax.kernels.linalg import cholesky, product, solve, solve_upper, symmetric
 from mjx_drax.kernels.recursion import affine_recursion
 from mjx_drax.kernels.riccati_gpu import vmapped_as_kernel
 from mjx_drax.method.model import Linearization, QuadraticCost
@@ -119,16 +119,16 @@ def factorize(
         P, p = carry
         A, B, h, gx, gu, Hxx, Hux, Huu, multiplier = inputs
         Ls = cholesky(identity + soft * P)
-        relaxed = solve(Ls, jnp.column_stack([P, p + soft * (P @ multiplier)]))
+        relaxed = solve(Ls, jnp.column_stack([P, p + soft * product(P, multiplier)]))
         P_relaxed, p_relaxed = symmetric(relaxed[:, :-1]), relaxed[:, -1]
-        slope = P_relaxed @ h + p_relaxed
-        PA, PB = P_relaxed @ A, P_relaxed @ B
-        Qxx, Qux, Quu = Hxx + A.T @ PA, Hux + B.T @ PA, Huu + B.T @ PB
-        qx, qu = gx + A.T @ slope, gu + B.T @ slope
+        slope = product(P_relaxed, h) + p_relaxed
+        PA, PB = product(P_relaxed, A), product(P_relaxed, B)
+        Qxx, Qux, Quu = Hxx + product(A.T, PA), Hux + product(B.T, PA), Huu + product(B.T, PB)
+        qx, qu = gx + product(A.T, slope), gu + product(B.T, slope)
         Lu = cholesky(Quu)
         gains = -solve(Lu, jnp.column_stack([Qux, qu]))
         K, kff = gains[:, :-1], gains[:, -1]
-        before = symmetric(Qxx + Qux.T @ K), qx + Qux.T @ kff
+        before = symmetric(Qxx + product(Qux.T, K)), qx + product(Qux.T, kff)
         return before, Factorization(K, kff, Lu, Ls, P, p)
 
     inputs = (model.A, model.B, model.h, cost.gx[:-1], cost.gu, cost.Hxx[:-1], cost.Hux, cost.Huu)
@@ -155,13 +155,13 @@ def solve_and_sample(
         model: Linearization, factors: Factorization, multiplier: Array, white: White | None
     ) -> tuple[Array, Array]:
         """F, and the columns f of the step and of the noise."""
-        step = model.h + model.B @ factors.kff
-        closed = model.A + model.B @ factors.gains
+        step = model.h + product(model.B, factors.kff)
+        closed = model.A + product(model.B, factors.gains)
         right = [closed, step + soft * (multiplier - factors.p)]
         if white is None:
             out = solve(factors.Ls, jnp.column_stack(right))
             return out[:, :-1], out[:, -1:]
-        noise = model.B @ solve_upper(factors.Lu, white.u)
+        noise = product(model.B, solve_upper(factors.Lu, white.u))
         out = solve(factors.Ls, jnp.column_stack([*right, noise]))
         f_noise = out[:, -1] - jnp.sqrt(soft) * solve_upper(factors.Ls, white.e)
         return out[:, :-2], jnp.column_stack([out[:, -2], f_noise])
@@ -173,13 +173,13 @@ def solve_and_sample(
     after = affine_recursion(F, f)  # dx_1..dx_K, of dx_0 = 0 or with f_0 of the other one
     zeroth = jnp.zeros_like(after[:1]) if first is None else first[None]
     before = jnp.concatenate([zeroth, after[:-1]])
-    controls = factors.gains @ before
+    controls = jax.vmap(product)(factors.gains, before)
     dx, du = after[..., 0], controls[..., 0] + factors.kff
     noise_x, noise_u = None, None
     if white is not None:
         noise_x = after[..., 1]
         noise_u = controls[..., 1] + jax.vmap(solve_upper)(factors.Lu, white.u)
-    costate = jnp.einsum("kij,kj->ki", factors.P, dx) + factors.p
+    costate = jax.vmap(product)(factors.P, dx) + factors.p
     return Step(dx, du, noise_x, noise_u, costate - multipliers, factors.gains)
 
 

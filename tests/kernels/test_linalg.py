@@ -8,6 +8,7 @@ from mjx_drax.kernels.linalg import (
     SUMMED_UP_TO,
     UNROLLED_UP_TO,
     cholesky,
+    product,
     solve,
     solve_lower,
     solve_upper,
@@ -98,3 +99,14 @@ def test_transposed_products_are_the_same_however_they_are_written(rows, columns
 
     monkeypatch.setattr(jax.lax, "platform_dependent", as_on_gpus)
     np.testing.assert_allclose(jax.vmap(transposed_product)(J, A), wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("columns", [(), (4,)])
+@pytest.mark.parametrize("k", [0, 1, UNROLLED_UP_TO, UNROLLED_UP_TO + 1])
+def test_products_of_any_size_and_of_small_ones_without_the_library(k, columns):
+    rng = np.random.default_rng(k)
+    A, B = rng.normal(size=(BATCH, 3, k)), rng.normal(size=(BATCH, k, *columns))
+    over = jax.vmap(product)
+    np.testing.assert_allclose(over(A, B), np.einsum("bnk,bk...->bn...", A, B), atol=1e-9)
+    calls_library = "dot_general" in str(jax.make_jaxpr(over)(A, B))
+    assert calls_library == (not 0 < k <= UNROLLED_UP_TO)
