@@ -22,6 +22,7 @@ from jax import Array
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import HostOnly
+from mjx_drax.kernels.batching import on_gpu
 from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
@@ -46,13 +47,10 @@ from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.rollout import replay_by
 from mjx_drax.problem.trajectory import Knot
 
-STEP_LIMIT = 2_000
-"""Scalar operations of f, above which it stays in the array operations of MJX. Its derivatives may
-take several times as many, and compilers need minutes for tens of thousands."""
-
-BODY_LIMIT = 1_000
-"""The same of one physics step, where f is a loop of them. Its tangents are rows of ndx + nu then:
-with 1,700 operations a quadrotor compiled for 50 s longer on a CPU, and was twice as fast."""
+STEP_LIMIT = 1_000
+"""Scalar operations of f, or of one of its physics steps where f is a loop of them, above which it
+stays in the array operations of MJX. Its derivatives may take several times as many, and compilers
+need minutes for tens of thousands: at 1,100 a satellite's did not end within 400 s on a CPU."""
 
 KNOWN_SIZE = 4_096
 """Numbers in an array of a model, above which compiled functions know none of them."""
@@ -453,19 +451,38 @@ def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.
 
 
 def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Array) -> Array:
-    def one(model: mjx.Model, x: Array, u: Array, by_operations: bool = False) -> Array:
-        return one_step.step(structure.fixed_in(model), x, u, by_operations)
-
     def every(one: Callable[..., Array], model: mjx.Model, x: Array, u: Array) -> Array:
         return jax.lax.scan(lambda x, _: (one(model, x, u), None), x, length=substeps)[0]
 
     if has_constraints(model):  # their forces come from a loop, which stays one of arrays
         return every(one_step.step, structure.fixed_in(model), x, u)
+
+    def one(model: mjx.Model, x: Array, u: Array, by_operations: bool = False) -> Array:
+        return one_step.step(structure.fixed_in(model), x, u, by_operations)
+
     body = partial(one, by_operations=True)
     # Where all steps are too much, the loop stays one, if possible of scalar arithmetic
-    lean = scalarized(body, BODY_LIMIT, otherwise=one) if substeps > 1 else one
+    if on_gpu():  # where a kernel inside of a loop takes ten times as long
+        lean = scalarized(body, STEP_LIMIT, otherwise=one)
+    else:
+        in_kernel = scalarized(body, outermost=True, otherwise=one)
+        lean = one_step.with_jacobian(in_kernel, partial(_jacobian, one), one)
     whole = scalarized(partial(every, body), STEP_LIMIT, otherwise=partial(every, lean))
     return whole(model, x, u)
+
+
+def _jacobian(
+    one: Callable[..., Array], model: mjx.Model, x: Array, u: Array
+) -> tuple[Array, Array]:
+    """A physics step and its Jacobian, in scalar arithmetic where that is possible."""
+    joints, ndx = Joints.of(model), 2 * model.nv + model.na
+
+    def moved(dz: Array) -> Array:
+        return one(model, joints.integrate(x, dz[:ndx]), u + dz[ndx:])
+
+    by, size = InScalars(Autodiff()), ndx + model.nu
+    J, value = by.jacobian(moved, size, jax.random.key(0))  # which draws nothing
+    return value, J
 
 
 # One trace of each, shared by all that differentiate it

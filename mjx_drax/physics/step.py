@@ -37,7 +37,7 @@ from mjx_drax.kernels.constraint_solver import (
     pulled,
 )
 from mjx_drax.kernels.elliptic_cones import Cones
-from mjx_drax.kernels.linalg import cholesky, solve, solve_positive, symmetric
+from mjx_drax.kernels.linalg import cholesky, product, solve, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import internal, mjx, with_internal
 from mjx_drax.physics.contacts.collision import collision, make_data
@@ -236,31 +236,6 @@ def _rates_of(model: mjx.Model, x: Array, u: Array, derivatives: bool = True) ->
     return jnp.concatenate([_implicit(model, data), _activation_rates(model, data)])
 
 
-_rates = jax.custom_jvp(partial(_rates_of, derivatives=False))
-"""`_rates_of`, differentiated in closed form: see `_derivatives`."""
-
-
-@partial(_rates.defjvp, symbolic_zeros=True)
-def _rates_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    """Where numbers of the model change too, by the operations; else by `_derivatives`.
-
-    What depends on no tangent is computed once for all of them, and so is the Jacobian.
-    """
-    (model, x, u), (of_model, *of_rest) = primals, tangents
-    if all(isinstance(d, SymbolicZero) for d in jax.tree.leaves(of_model)):
-        rates, jacobian = _derivatives(model, x, u)
-        dx, du = map(_as_array, of_rest)
-        _, dx = jax.jvp(lambda y: Joints.of(model).difference(y, x), (x,), (dx,))
-        return rates, jacobian @ jnp.concatenate([dx, du])
-    return jax.jvp(_rates_of, primals, jax.tree.map(_as_array, tangents))
-
-
-def _as_array(tangent: Any) -> Any:
-    if isinstance(tangent, SymbolicZero):
-        return np.zeros(tangent.shape, tangent.dtype)
-    return tangent
-
-
 def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     """`_rates` (nv + na,) and their Jacobian in the tangent space, (nv + na, ndx + nu).
 
@@ -324,6 +299,45 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
         d = _solve_implicit(model, data, M @ d - later)
     value = jnp.concatenate([b, _activation_rates(model, data)])
     return value, jnp.concatenate([d, rates])
+
+
+def with_jacobian(
+    function: Callable[..., Array],
+    jacobian: Callable[..., tuple[Array, Array]],
+    by_operations: Callable[..., Array],
+) -> Callable[..., Array]:
+    """A function of a model, a state and a control, differentiated by its Jacobian.
+
+    What depends on no tangent is computed once for all of them, and so is the Jacobian.
+
+    Args:
+        function: (model, x, u) -> (m,).
+        jacobian: (model, x, u) -> its value, and its Jacobian in the tangent space, (m, ndx + nu).
+        by_operations: the same function, for derivatives where numbers of the model change too.
+    """
+    new = jax.custom_jvp(function)
+
+    @partial(new.defjvp, symbolic_zeros=True)
+    def jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+        (model, x, u), (of_model, *of_rest) = primals, tangents
+        if not all(isinstance(d, SymbolicZero) for d in jax.tree.leaves(of_model)):
+            return jax.jvp(by_operations, primals, jax.tree.map(_as_array, tangents))
+        value, J = jacobian(model, x, u)
+        dx, du = map(_as_array, of_rest)
+        _, dx = jax.jvp(lambda y: Joints.of(model).difference(y, x), (x,), (dx,))
+        return value, product(J, jnp.concatenate([dx, du]))
+
+    return new
+
+
+def _as_array(tangent: Any) -> Any:
+    if isinstance(tangent, SymbolicZero):
+        return np.zeros(tangent.shape, tangent.dtype)
+    return tangent
+
+
+_rates = with_jacobian(partial(_rates_of, derivatives=False), _derivatives, _rates_of)
+"""`_rates_of`, differentiated in closed form."""
 
 
 def _tendon_inertia_times(model: mjx.Model, data: mjx.Data, qacc: Array) -> Array:

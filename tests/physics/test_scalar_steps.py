@@ -159,21 +159,25 @@ def test_derivatives_in_closed_form_are_those_of_the_operations(integrator):
 
 
 def test_more_operations_than_scalars_are_for_are_derived_in_closed_form(monkeypatch):
-    """A chain of rods, of whose step the limit makes one of arrays."""
-    dynamics, asked = task(MODELS["chain"]).dynamics, []
-    closed = one_step._derivatives
-    monkeypatch.setattr(one_step, "_derivatives", lambda *a: asked.append(a) or closed(*a))
-    z = jnp.asarray(RNG.uniform(-1.0, 1.0, 12), jnp.float32)
+    """An acrobot, of whose step the limit makes one of arrays."""
+    dynamics, asked = task("acrobot").dynamics, []
+    closed = one_step.inverse_derivatives  # by which nothing else is computed
+    monkeypatch.setattr(one_step, "inverse_derivatives", lambda *a: asked.append(a) or closed(*a))
+    z = jnp.asarray(RNG.uniform(-1.0, 1.0, 5), jnp.float32)
     found = []
     for limit in (mjx_dynamics.STEP_LIMIT, 100):
         monkeypatch.setattr(mjx_dynamics, "STEP_LIMIT", limit)
         jax.clear_caches()
-        found.append(jax.jit(jax.jacfwd(lambda z: dynamics.step(z[:10], z[10:])))(z))
+        found.append(jax.jit(jax.jacfwd(lambda z: dynamics.step(z[:4], z[4:])))(z))
         assert bool(asked) is (limit == 100)
     close(*found, 1e-4)
 
 
-def test_many_small_steps_are_a_loop_of_scalar_arithmetic(monkeypatch):
+@pytest.mark.parametrize("gpu", [True, False])
+def test_many_small_steps_are_a_loop_of_scalar_arithmetic(gpu, monkeypatch):
+    """On CPUs each step's value and Jacobian come from a kernel, whose outputs are put in place."""
+    monkeypatch.setattr(mjx_dynamics, "on_gpu", lambda: gpu)
+    jax.clear_caches()
     dynamics = task("cartpole", dt=0.1).dynamics
     assert dynamics.substeps == 10
     x, u = jnp.array([0.1, 0.4, -0.3, 0.2]), jnp.array([0.5])
@@ -186,8 +190,12 @@ def test_many_small_steps_are_a_loop_of_scalar_arithmetic(monkeypatch):
     program = jax.make_jaxpr(pruned(derivatives))(dynamics, x, u).jaxpr
     loops = [body for name, body in operations(program) if name == "scan"]
     assert len(loops) == 1
+    kernels = [name for name, _ in operations(loops[0])].count("custom_vmap_call")
+    assert kernels == (0 if gpu else 1)
     names = {name for name, _ in operations(loops[0])}
     assert {"sin", "cos"} <= names
+    if not gpu:
+        names.remove("gather")  # which places a kernel's outputs
     assert not names & {"dot_general", "gather", "scatter", "cholesky", "while"}
     seen = jax.jit(derivatives)(dynamics, x, u)
     monkeypatch.setattr(mjx_dynamics, "scalarized", lambda function, *_, **__: function)
