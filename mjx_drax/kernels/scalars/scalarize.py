@@ -74,11 +74,11 @@ def scalarized(
 
     With more than `limit` operations (each entry of a traced array that is read counts as one; by
     default LIMIT or CPU_LIMIT) it stays as it is, or is `otherwise`, if given, which computes the
-    same. Arrays that the function
-    closes over and that are not traced are known numbers, whose zeros and ones are used. Arguments
-    are not. Functions with their own derivative rule (custom_jvp, custom_vjp) are not opened,
-    because the result may be differentiated: differentiate first. If it is `outermost`, which
-    nobody differentiates, one kernel computes it for all rows of a batch.
+    same. Arrays that the function closes over and that are not traced are known numbers, whose
+    zeros and ones are used. Arguments are not. Functions with their own derivative rule
+    (custom_jvp, custom_vjp) are not opened, because the result may be differentiated: differentiate
+    first. If it is `outermost`, which nobody differentiates, one kernel computes it for all rows of
+    a batch.
     """
 
     @wraps(function)
