@@ -172,15 +172,15 @@ def product(A: Array, B: Array) -> Array:
 def transposed_product(J: Array, A: Array) -> Array:
     """J' A, (n, k) or (n,), for J (m, n) and A (m, k) or (m,)."""
 
-    def product(J: Array, A: Array) -> Array:
+    def by_library(J: Array, A: Array) -> Array:
         return J.T @ A
 
     def summed(J: Array, A: Array) -> Array:
         return jnp.sum(J.reshape(*J.shape, *[1] * (A.ndim - 1)) * A[:, None], axis=0)
 
     if J.size > SUMMED_UP_TO:
-        return product(J, A)
-    return jax.lax.platform_dependent(J, A, cpu=product, default=summed)
+        return by_library(J, A)
+    return jax.lax.platform_dependent(J, A, cpu=by_library, default=summed)
 
 
 def symmetric(matrix: Array) -> Array:

@@ -48,9 +48,10 @@ from mjx_drax.problem.rollout import replay_by
 from mjx_drax.problem.trajectory import Knot
 
 STEP_LIMIT = 1_000
-"""Scalar operations of f, or of one of its physics steps where f is a loop of them, above which it
-stays in the array operations of MJX. Its derivatives may take several times as many, and compilers
-need minutes for tens of thousands: at 1,100 a satellite's did not end within 400 s on a CPU."""
+"""Scalar operations of f, above which it stays in the array operations of MJX, or is a loop; on
+GPUs also of each physics step of that loop. Its derivatives may take several times as many, and
+compilers need minutes for tens of thousands: at 1,070 a satellite's did not end within 400 s on a
+CPU."""
 
 KNOWN_SIZE = 4_096
 """Numbers in an array of a model, above which compiled functions know none of them."""
@@ -462,7 +463,7 @@ def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Ar
 
     body = partial(one, by_operations=True)
     # Where all steps are too much, the loop stays one, if possible of scalar arithmetic
-    if on_gpu():  # where a kernel inside of a loop takes ten times as long
+    if on_gpu():  # where kernels inside of a loop made iterations 6 to 25 times as long
         lean = scalarized(body, STEP_LIMIT, otherwise=one)
     else:
         in_kernel = scalarized(body, outermost=True, otherwise=one)

@@ -35,9 +35,16 @@ def vmapped_as_kernel(program: ClosedJaxpr) -> Callable[..., Array]:
     program's outputs as one vector.
     """
 
-    def one(*inputs: Array) -> Array:
+    def by_entries(*inputs: Array) -> Array:
         entries = [entry for array in inputs for entry in jnp.ravel(array)]
         return jnp.stack(jaxpr_as_fun(program)(*entries))
+
+    @jax.custom_jvp
+    def in_parts(*inputs: Array) -> Array:
+        return by_windows(program, [True] * len(inputs), *(a[None] for a in inputs))[0]
+
+    in_parts.defjvp(partial(jax.jvp, by_entries))
+    one = in_parts if len(program.eqns) > PART and not on_gpu() else by_entries
 
     def all_rows(has_rows: tuple[bool, ...], *inputs: Array) -> Array:
         if not on_gpu():

@@ -49,6 +49,19 @@ def test_a_cpu_computes_every_row_in_parts(program, has_rows, size, monkeypatch)
     np.testing.assert_allclose(seen, wanted, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("size", "in_parts"), [(1_000, False), (7, True)])
+def test_a_row_alone_goes_in_parts_where_many_rows_do(program, size, in_parts, monkeypatch):
+    """Else a CPU compiled the Jacobian of one knot of a quadrotor for minutes."""
+    monkeypatch.setattr(kernel, "PART", size)
+    inputs = [RNG.uniform(0.5, 2.0, 2).astype(np.float32) for _ in range(3)]
+    alone = vmapped_as_kernel(program)
+    assert ("reduce_window" in str(jax.make_jaxpr(alone)(*inputs))) is in_parts
+    np.testing.assert_allclose(jax.jit(alone)(*inputs), function(*inputs), rtol=1e-6)
+    seen, wanted = (jax.jit(jax.jacfwd(f, (0, 1, 2)))(*inputs) for f in (alone, function))
+    for a, b in zip(seen, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
 def test_outputs_may_be_inputs():
     same = jax.make_jaxpr(lambda a, b, c: [a, b, a * c])(*[jnp.ones(())] * 3)
     a, b, c = np.arange(3.0, dtype=np.float32), np.float32(5.0), np.full(3, 2.0, np.float32)
