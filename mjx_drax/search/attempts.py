@@ -132,9 +132,16 @@ def noise_is_better(done: np.ndarray, iterations: np.ndarray) -> bool:
 
 
 def owners_of_places(done: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """For which chain each place works: those that are not done, the worst first, (chains,)."""
-    worst_first = np.argsort(-cost, kind="stable")
-    return np.resize(worst_first[~done[worst_first]] if not done.all() else [0], len(done))
+    """For which chain each place works: those that are not done, the worst first, (..., chains).
+
+    If all are done, for the first one.
+    """
+    order = np.argsort(-cost, axis=-1, kind="stable")
+    done_last = np.argsort(np.take_along_axis(done, order, -1), axis=-1, kind="stable")
+    unfinished = np.take_along_axis(order, done_last, -1)
+    count = (~done).sum(axis=-1, keepdims=True)
+    turn = np.arange(done.shape[-1]) % np.maximum(count, 1)
+    return np.where(count > 0, np.take_along_axis(unfinished, turn, -1), 0)
 
 
 def stricter(cost_scale: np.ndarray, feasible: np.ndarray) -> np.ndarray:
@@ -145,7 +152,11 @@ def stricter(cost_scale: np.ndarray, feasible: np.ndarray) -> np.ndarray:
     return np.where(feasible.mean(axis=1) < FEW, STRICTER * cost_scale, cost_scale)
 
 
-def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: float) -> float:
-    """The scale of the costs of answers: the best so far, or what all have if none is feasible."""
-    scale = abs(costs[feasible].min()) if feasible.any() else median(costs)
-    return max(float(scale), NEGLIGIBLE * cost_scale)
+def temperature(costs: np.ndarray, feasible: np.ndarray, cost_scale: ArrayLike) -> np.ndarray:
+    """The scale of the costs of answers (..., chains), (...,), not negligible beside `cost_scale`.
+
+    That is the best cost so far, or what all have if none is feasible.
+    """
+    best = np.abs(np.where(feasible, costs, np.inf).min(axis=-1))
+    scale = np.where(feasible.any(axis=-1), best, median(costs))
+    return np.maximum(scale, NEGLIGIBLE * np.asarray(cost_scale))

@@ -191,3 +191,15 @@ def gather(kept: Any, found: Any, source: Array) -> Any:
         return jnp.where(mine, a[source % chains], b[source % chains])
 
     return jax.tree.map(rows, kept, found)
+
+
+@jax.jit
+def taken(tree: Any, rows: Array) -> Any:
+    """Those rows of every array; the last one for rows beyond the end."""
+    return jax.tree.map(lambda a: a.at[rows].get(mode="clip"), tree)
+
+
+@jax.jit
+def put_back(tree: Any, some: Any, rows: Array) -> Any:
+    """The arrays with others in those rows; rows beyond the end are left out."""
+    return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), tree, some)

@@ -4,7 +4,9 @@ An attempt draws initial knots for every chain of a chunk's problems, runs the f
 rollouts if the settings say so, and keeps the best of every chain. Each problem has its own scales,
 random numbers and attempts, so its answer does not depend on which others are solved beside it.
 `solve` and `minimize` have one problem and one chunk. `solve_batch` packs the problems that are not
-done into chunks of one size, which one compilation serves and which fit into memory.
+done into chunks of one size, which one compilation serves and which fit into memory. A large chunk
+thins out: the last chains that move go on in a program for few problems, as later attempts do. GPUs
+round them there as they do in the chunk; CPUs may not.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -46,7 +49,9 @@ from mjx_drax.search.chains import (
     finished,
     gather,
     improved,
+    put_back,
     slim,
+    taken,
     unset,
 )
 from mjx_drax.search.checkpoint import Checkpoint, facts
@@ -78,6 +83,10 @@ of an attempt's where that is more."""
 
 STRAGGLERS = 0.0005
 """Share of chains for which the polish of the others does not wait."""
+
+MANY, FEWER = 2048, 8
+"""A batch of at least MANY chains has a second program, for a FEWER-th of its problems: what still
+moves when most are done goes on there, and so do later attempts at few problems."""
 
 FAR, COOLER, MOST_COOLINGS = 10.0, 0.25, 4
 """If noise raises max|h| of most chains above FAR times that of the initial knots, or above FAR^2,
@@ -190,10 +199,21 @@ class Search:
         return polish if polish and polish.iterations else None
 
     @property
+    def few(self) -> int:
+        """Problems of the second program; 0: there is none."""
+        many = self.size * self.chains >= MANY and self.mesh is None and self.polish is not None
+        return self.size // FEWER if many and not self.family.alone else 0
+
+    @property
+    def width(self) -> int:
+        """Problems in a chunk of this attempt."""
+        return self.few if self.few and 2 * len(self.stage.todo) <= self.size else self.size
+
+    @property
     def indices(self) -> np.ndarray:
-        """Problems of the chunk, (size,); the last chunk is filled up with problems again."""
-        stage = self.stage
-        return np.resize(stage.todo[stage.place : stage.place + self.size], self.size)
+        """Problems of the chunk, (width,); the last chunk is filled up with problems again."""
+        stage, width = self.stage, self.width
+        return np.resize(stage.todo[stage.place : stage.place + width], width)
 
     @rarely_collected()
     def _begin_search(self) -> None:
@@ -213,7 +233,7 @@ class Search:
         zeros: Any = np.zeros(rows, knots.u.dtype)
         info = Info.of(zeros)
         if not saved:  # else it will be replaced; an answer needs no compiling
-            _, info = self._iterated(state, 0, 0)
+            info = self._compile(state)
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
         now = Chains.of(state, info, np.full(rows, -1))
         kept = None if family.alone else unset(now, family.count * self.chains)
@@ -239,6 +259,25 @@ class Search:
             records=((0, info),),
         )
         self._measure()
+
+    def _compile(self, state: State) -> Info:
+        """Compile what iterates; the diagnostics of a chunk's states."""
+        if not self.few or len(state.alive) < self.size * self.chains:
+            return self._iterated(state, 0, 0)[1]
+        with ThreadPoolExecutor(1) as pool:
+            second = pool.submit(self._compile_second, state, jnp.result_type(float))
+            _, info = self._iterated(state, 0, 0)
+            second.result()
+        return info
+
+    def _compile_second(self, state: State, dtype: Any) -> None:
+        """Compile the program for few problems, and what begins and ends with it."""
+        with jax.enable_x64(dtype == jnp.float64):  # threads do not inherit it
+            knots, keys = self._drawn(0, np.arange(self.few))
+            rows, (shared, own) = np.arange(len(keys)), self.question
+            begin(taken(own, rows), shared, replace(knots, slack=None), keys)
+            nothing = Info.of(np.zeros(len(state.alive), dtype))
+            self._go_on(state, nothing, rows, 0, 0)
 
     def _begun(self, attempt: int, knots: Trajectory, keys: Array) -> State:
         """The first state of every row of an attempt."""
@@ -273,8 +312,7 @@ class Search:
             assert self.settings.done_share is not None
             cost, bar = self._sound_costs(stage.kept, indices), self._done_up_to(indices)
             left_alone = (cost <= bar) & (self.settings.done_share <= 1.0)
-            rows = zip(left_alone, cost, strict=True)
-            owners = np.concatenate([owners_of_places(*row) for row in rows])
+            owners = owners_of_places(left_alone, cost).ravel()
         knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, stage.heated, indices, stage.cost_scale)
         state = self._begun(stage.attempt, knots, keys)
@@ -302,11 +340,9 @@ class Search:
         shared, own = self.question
         knots = gathered(stage.now.state.trajectory, self.mesh)
         sizes = jax.tree.map(np.asarray, sizes_of(own, shared, replace(knots, slack=None)))
+        of_problem = jax.tree.map(lambda a: a.reshape(-1, self.chains), sizes)
         scale, floor = stage.cost_scale.copy(), stage.floor.copy()
-        for row, index in enumerate(indices):
-            mine = slice(row * self.chains, (row + 1) * self.chains)
-            of_row = jax.tree.map(lambda a, mine=mine: a[mine], sizes)
-            scale[index], floor[index] = scale_and_floor(of_row, self.polish is not None)
+        scale[indices], floor[indices] = scale_and_floor(of_problem, self.polish is not None)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
         self._settle(0, False, indices, scale)
 
@@ -317,7 +353,7 @@ class Search:
         if self.family.alone:
             kind = int(stage.heated)
             ends[kind], steps[kind] = stage.now.sound_cost, max(stage.step, 1)
-        place = min(stage.place + self.size, len(stage.todo))
+        place = min(stage.place + self.width, len(stage.todo))
         self.stage = replace(stage, kept=kept, ends=ends, steps=steps, place=place, begun=False)
         if not self.family.alone:
             self._save()
@@ -457,7 +493,7 @@ class Search:
             return finished(kept, now)
         if self.family.alone:
             return best_of(kept, now, stage.owners)
-        fresh = min(self.size, len(stage.todo) - stage.place)
+        fresh = min(self.width, len(stage.todo) - stage.place)
         of_problem = np.arange(self.chains)
         rows = (self.indices[:fresh, None] * self.chains + of_problem).ravel()
         first = np.repeat(np.arange(fresh) * self.chains, self.chains)
@@ -503,8 +539,8 @@ class Search:
             assert kept is not None
             shape = self.family.count, self.chains
             costs = kept.cost.reshape(shape) - self.stage.floor[:, None]
-            rows = costs[indices], kept.feasible.reshape(shape)[indices]
-            noise = np.sqrt([temperature(*row) for row in zip(*rows, cost, strict=True)])
+            feasible = kept.feasible.reshape(shape)[indices]
+            noise = np.sqrt(temperature(costs[indices], feasible, cost))
             noise *= COOLER**self.stage.coolings
         elif attempt == 0 or not settings.heated:
             flow = replace(flow, iterations=settings.descent)
@@ -547,9 +583,13 @@ class Search:
         try:
             while self.stage.step < total and self._waits(self.stage.now):
                 stage, now = self.stage, self.stage.now
-                every = self._report_every(total)
-                stop = min(stage.step - stage.step % every + every, total)
+                stop = self._next_report(total)
                 state, info = self._iterated(now.state, stage.step, stop)
+                if self._thins_out:
+                    moving = np.flatnonzero(self._moving(state))
+                    if len(moving) <= self.few * self.chains:
+                        state, info = self._go_on(state, info, moving, stop, total)
+                        stop = total
                 if stage.attempt == stage.place == stage.step == 0:
                     died_at = on_host(state.died_at, self.mesh)
                     if (died_at == 0).all():
@@ -580,7 +620,7 @@ class Search:
         if not (noisy and self.family.alone and stage.step <= self.flow.iterations):
             return False
         first, now = (np.asarray(info.max_defect) for info in (stage.records[0][1], stage.now.info))
-        far = FAR * max(median(first), FAR)
+        far = FAR * max(float(median(first)), FAR)
         return stage.coolings < MOST_COOLINGS and bool((~(now < far)).mean() > 0.5)
 
     def _require_some(self, now: Chains) -> None:
@@ -632,12 +672,41 @@ class Search:
         """Iterations between two reports of an attempt of so many."""
         return max(REPORT_EVERY, total // 100)
 
-    def _report_every(self, total: int) -> int:
-        """The same, or fewer where knots are recorded more often; all of them in a batch."""
-        if not self.family.alone:  # nobody is told before a chunk is done
-            return total
-        usual = self._usual_report(total)
-        return usual if self.recorder is None else min(usual, self.recorder.every)
+    def _next_report(self, total: int) -> int:
+        """After which of an attempt's iterations the next report is, or the next look at a batch.
+
+        Nobody is told of a batch before a chunk is done: a look is for what has left its place.
+        """
+        step, every = self.stage.step, self._usual_report(total)
+        if not self.family.alone:
+            first = self.flow.iterations + every
+            return min(max(step + every, first), total) if self._thins_out else total
+        if self.recorder is not None:
+            every = min(every, self.recorder.every)
+        return min(step - step % every + every, total)
+
+    @property
+    def _thins_out(self) -> bool:
+        """Whether what still moves when most are done goes on in the second program."""
+        return 0 < self.few < self.width
+
+    def _go_on(
+        self, state: State, info: Info, rows: np.ndarray, start: int, stop: int
+    ) -> tuple[State, Info]:
+        """Iterations start..stop-1 of those rows alone, in the second program, if there are any."""
+        if not len(rows):
+            return state, info
+        places = np.full(self.few * self.chains, len(state.alive))  # beyond the end: a copy, unused
+        places[: len(rows)] = rows
+        mine = taken((state, self.question[1]), places)
+        moved, found = self.launch(mine, start, stop)
+
+        def updated(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+            both = np.array(old)
+            both[rows] = new[: len(rows)]
+            return both
+
+        return put_back(state, moved, places), jax.tree.map(updated, info, on_host(found, None))
 
     # Rollouts
 
@@ -861,7 +930,8 @@ class Search:
             self.recorder.restore(saved["recorder"])
         if not saved["ended"]:
             self._settle(stage.attempt, stage.heated, self.indices, stage.cost_scale)
-            self._iterated(state, 0, 0)  # just compiles
+            if len(self.indices) * self.chains == len(self.stage.owners):
+                self._compile(self.stage.now.state)
         return saved["solve_time"], saved["ended"]
 
     def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:

@@ -142,32 +142,32 @@ def _step(g: Array, H: Array, reach: Array) -> Array:
 def scale_at(problem: Problem, flow: Langevin, knots: Trajectory) -> float:
     """The scale of costs at knots (chains, K, ...) of one problem, for a flow with its tail."""
     shared, own = partition(Question(flow, problem), None)
-    return scale_and_floor(sizes_of(own, shared, knots), polished=False)[0]
+    return float(scale_and_floor(sizes_of(own, shared, knots), polished=False)[0])
 
 
-def scale_and_floor(sizes: Sizes, polished: bool) -> tuple[float, float]:
-    """The scale of costs of one problem, and the floor of its cost, from chains' (chains,).
+def scale_and_floor(sizes: Sizes, polished: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The scales of costs of problems, (...,), and the floors of their costs, from (..., chains).
 
     Without a polish it is the penalty that holds the dynamics against the terminal cost: there T
     counts in full.
     """
     of_running, of_end = _least(sizes.least_running), _least(sizes.least_terminal)
-    R = SHARE * median(np.asarray(sizes.running, float) - of_running)
-    T = SHARE * median(np.asarray(sizes.terminal, float) - of_end)
+    R = SHARE * median(np.asarray(sizes.running, float) - of_running[..., None])
+    T = SHARE * median(np.asarray(sizes.terminal, float) - of_end[..., None])
     E = EFFORT * median(sizes.effort)
-    limit = max(E, R)
-    return R + (min(T, limit) if polished and limit > 0.0 else T) or 1.0, of_running + of_end
+    limit = np.maximum(E, R)
+    scale = R + (np.where(limit > 0.0, np.minimum(T, limit), T) if polished else T)
+    return np.where(scale == 0.0, 1.0, scale), of_running + of_end
 
 
-def _least(values: Any) -> float:
-    """The least of finite values; 0 if there is none."""
+def _least(values: Any) -> np.ndarray:
+    """The least of finite values (..., n), (...,); 0 if there is none."""
     values = np.asarray(values, float)
-    finite = values[np.isfinite(values)]
-    return float(finite.min()) if finite.size else 0.0
+    least = np.where(np.isfinite(values), values, np.inf).min(axis=-1)
+    return np.where(np.isfinite(least), least, 0.0)
 
 
-def median(values: Any) -> float:
-    """Median of the absolute values of finite numbers; 0 if there is none."""
-    values = np.abs(np.asarray(values, float))
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else 0.0
+def median(values: Any) -> np.ndarray:
+    """Median of the absolute values of finite numbers (..., n), (...,); 0 if there is none."""
+    finite = np.ma.masked_invalid(np.abs(np.asarray(values, float)))
+    return np.ma.filled(np.ma.median(finite, axis=-1), 0.0)

@@ -1,6 +1,7 @@
 """Pendulums from random states, beside what dynamic programming says is possible.
 
     python -m mjx_drax.studies.random_states [--states N] [--chains M ...] [--seeds S]
+                                             [--attempts A]
 
 N initial states of the task `pendulum`, angle and velocity from U(-4, 4), in one `solve_batch`. Not
 every state can be brought upright within the horizon. Dynamic programming finds which can: with
@@ -27,6 +28,7 @@ from jax.scipy.ndimage import map_coordinates
 
 from mjx_drax import tasks
 from mjx_drax.problem.problem import Problem
+from mjx_drax.search.restarts import Restarts
 from mjx_drax.solution.batch import BatchSolution, solve_batch
 from mjx_drax.solution.progress import reporting
 
@@ -34,8 +36,10 @@ ANGLES, VELOCITIES, CONTROLS = (60.0, 6001), (14.0, 1401), 41
 """Reach and number of the grid's points: some states can but turn over and over."""
 
 HEADER = (
-    "| chains | seed | feasible | residual below the tolerance | upright | of those that can "
-    "| within 1.2 times dynamic programming | solve [s] | compile [s] |\n" + "|---" * 9 + "|"
+    "| chains | attempts | seed | feasible | residual below the tolerance | upright "
+    "| of those that can | within 1.2 times dynamic programming | solve [s] | compile [s] |\n"
+    + "|---" * 10
+    + "|"
 )
 
 
@@ -86,14 +90,21 @@ def values(
     return np.asarray(found), np.array(upright)
 
 
-def line(found: BatchSolution, chains: int, seed: int, best: np.ndarray, can: np.ndarray) -> str:
+def line(
+    found: BatchSolution,
+    chains: int,
+    attempts: int,
+    seed: int,
+    best: np.ndarray,
+    can: np.ndarray,
+) -> str:
     """The row of a solve, in Markdown."""
     upright = found.open_loop.success | found.feedback.success
     cost = np.minimum(found.open_loop.cost, found.feedback.cost)
     close = cost <= 1.2 * best + 1e-3
     residual = found.chain_residual.min(axis=1) < found.tolerance
     return (
-        f"| {chains} | {seed} | {found.feasible.mean():.2%} | {residual.mean():.2%} "
+        f"| {chains} | {attempts} | {seed} | {found.feasible.mean():.2%} | {residual.mean():.2%} "
         f"| {upright.mean():.1%} | {(upright & can).sum() / can.sum():.1%} | {close.mean():.1%} "
         f"| {found.solve_time:.2f} | {found.compile_time:.0f} |"
     )
@@ -105,6 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--states", type=int, default=16_384, metavar="N")
     parser.add_argument("--chains", type=int, nargs="+", default=[1, 2, 4], metavar="M")
     parser.add_argument("--seeds", type=int, default=2, metavar="S")
+    parser.add_argument("--attempts", type=int, default=5, metavar="A", help="at most; default 5")
     options = parser.parse_args(arguments)
     problem = tasks.load("pendulum").make()
     x = np.random.default_rng(0).uniform(-4, 4, (options.states, 2)).astype(np.float32)
@@ -116,8 +128,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     for chains in options.chains:
         for seed in range(options.seeds):
-            found = solve_batch(lambda x: replace(problem, x_init=x), x, chains, seed)
-            print(line(found, chains, seed, best, can), flush=True)
+            found = solve_batch(
+                lambda x: replace(problem, x_init=x),
+                x,
+                chains,
+                seed,
+                solver=Restarts(attempts=options.attempts),
+            )
+            print(line(found, chains, options.attempts, seed, best, can), flush=True)
 
 
 if __name__ == "__main__":

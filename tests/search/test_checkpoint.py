@@ -27,6 +27,7 @@ from mjx_drax.base import digests
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.search import checkpoint, engine, recording
+from mjx_drax.search.engine import Search
 from mjx_drax.search.iterate import iterate
 from mjx_drax.search.restarts import Rollouts
 
@@ -162,6 +163,45 @@ def test_a_batch_that_is_killed_goes_on_to_the_same_answer(whole_batch, tmp_path
         batch(checkpoint=file, chunk=3)
     with pytest.raises(DraxError, match="was written for call solve_batch, and"):
         solved(checkpoint=file)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("often")
+def test_a_large_batch_goes_on_where_its_last_chains_were(tmp_path, monkeypatch):
+    for name, value in {"MANY": 16, "REPORT_EVERY": 2}.items():
+        monkeypatch.setattr(engine, name, value)
+    starts = np.random.default_rng(2).uniform(-0.3, 0.3, (8, 2)).astype(np.float32)
+    starts[5] = 0.9, 9.0  # it hits the wall, so later attempts are at this one alone
+    walls = replace(PROBLEM.bounds, x_upper=jnp.array([1.0, 10.0]))
+    given = {
+        "make": lambda x: replace(PROBLEM, x_init=x, bounds=walls),
+        "values": starts,
+        "chunk": None,
+        "solver": replace(SOLVER, done_share=None),
+    }
+    file, calls, kill_at, iterated = tmp_path / "run.ckpt", [], [], Search._iterated
+
+    def stopped(self, state, start, stop):
+        if stop > start:
+            calls.append(len(state.alive))
+            if [len(calls)] == kill_at:
+                raise Killed
+        return iterated(self, state, start, stop)
+
+    monkeypatch.setattr(Search, "_iterated", stopped)
+    whole = batch(**given)
+    widths = calls.copy()
+    assert widths[-2:] == [2, 2]
+    assert set(widths[:-2]) == {16}
+    assert len(widths) > 3
+    for count in range(2, len(widths) + 1):
+        calls.clear()
+        kill_at[:] = [count]
+        with pytest.raises(Killed):
+            batch(checkpoint=file, **given)
+        kill_at.clear()
+        assert_same(batch(checkpoint=file, **given), whole)
+        file.unlink()
 
 
 @pytest.mark.usefixtures("often")

@@ -8,6 +8,8 @@ import pytest
 from jax.tree_util import Partial
 
 from mjx_drax import DraxError, Langevin, Polish, Restarts, from_function, from_mjcf, solve_batch
+from mjx_drax.search import engine
+from mjx_drax.search.engine import Search
 
 DT = 0.1
 SOLVER = Restarts(replace(Restarts().flow, iterations=30, tail=20), descent=20, attempts=3)
@@ -113,20 +115,65 @@ def test_finished_problems_leave_the_batch():
 
 @pytest.mark.slow
 def test_only_problems_that_are_not_done_are_tried_again():
-    walls = replace(BASE.bounds, x_lower=jnp.array([-1.0, -10.0]), x_upper=jnp.array([1.0, 10.0]))
     starts = np.array([[0.0, 0.0], [0.9, 9.0], [0.1, 0.0]])  # the second one hits the wall
     done = []
 
     def solved(values, **rest):
-        return solve_batch(
-            lambda x: replace(BASE, x_init=x, bounds=walls), values, 2, solver=SOLVER, **rest
-        )
+        return solve_batch(between_walls, values, 2, solver=SOLVER, **rest)
 
     found = solved(starts, chunk=1, progress=lambda *n: done.append(n))
     assert done == [(1, 3), (2, 3), (3, 3), (3, 3), (3, 3)]  # two more attempts on one of three
     np.testing.assert_array_equal(found.feasible, [True, False, True])
     others = solved(starts[[0, 0, 2]], chunk=1)
     np.testing.assert_array_equal(found.u[[0, 2]], others.u[[0, 2]])
+
+
+WALLS = replace(BASE.bounds, x_lower=jnp.array([-1.0, -10.0]), x_upper=jnp.array([1.0, 10.0]))
+
+
+def between_walls(x):
+    return replace(BASE, x_init=x, bounds=WALLS)
+
+
+@pytest.mark.slow
+def test_the_last_chains_of_a_large_batch_go_on_by_themselves(monkeypatch):
+    starts = np.random.default_rng(1).uniform(-0.3, 0.3, (16, 2)).astype(np.float32)
+    starts[5] = 0.9, 9.0  # it hits the wall, in every attempt
+    whole = solve_batch(between_walls, starts, chains=2, solver=SOLVER)
+    looks, went_on, done = [], [], []
+    iterated, go_on = Search._iterated, Search._go_on
+
+    def seen(self, state, start, stop):
+        moved, info = iterated(self, state, start, stop)
+        looks.append((len(state.alive), stop, self._moving(moved).sum()))
+        return moved, info
+
+    def seen_going_on(self, state, info, rows, start, stop):
+        moved, new = go_on(self, state, info, rows, start, stop)
+        if stop > start:
+            went_on.append(len(rows))
+            np.testing.assert_array_equal(rows, np.flatnonzero(self._moving(state)))
+            others = np.delete(np.arange(32), rows)
+            np.testing.assert_array_equal(new.cost[others], info.cost[others])
+            knots, before = moved.trajectory.u, state.trajectory.u
+            np.testing.assert_array_equal(knots[others], before[others])
+            assert (np.abs(knots - before)[rows].max(axis=(1, 2)) > 0.0).all()
+            assert not self._moving(moved).any()
+        return moved, new
+
+    monkeypatch.setattr(engine, "MANY", 32)
+    monkeypatch.setattr(engine, "REPORT_EVERY", 2)
+    monkeypatch.setattr(Search, "_iterated", seen)
+    monkeypatch.setattr(Search, "_go_on", seen_going_on)
+    found = solve_batch(between_walls, starts, 2, solver=SOLVER, progress=lambda *n: done.append(n))
+    assert found.feasible.tolist() == whole.feasible.tolist() == [i != 5 for i in range(16)]
+    np.testing.assert_allclose(found.u[found.feasible], whole.u[found.feasible], 1e-4, 1e-4)
+    assert done == [(16, 16)] * 3
+    *first, second, third = [look for look in looks if look[1]]
+    assert [rows for rows, *_ in first] == [32] * len(first)
+    assert [still > 4 for *_, still in first] == [True] * (len(first) - 1) + [False]
+    assert went_on == [first[-1][2]] != [0]
+    assert second[0] == third[0] == 4  # where one problem is left
 
 
 @pytest.mark.slow

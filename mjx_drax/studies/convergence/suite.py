@@ -104,7 +104,7 @@ def ours(problem: Problem, knots: Trajectory, descent: int = 0) -> tuple[int, fl
     states = begin(own, shared, start, jax.random.key(0))
     if descent:
         cost, _ = scale_and_floor(jax.tree.map(np.asarray, sizes_of(own, shared, start)), True)
-        flow = replace(flow, scale=scale_of(cost, 0.0))
+        flow = replace(flow, scale=scale_of(float(cost), 0.0))
         shared, own = partition(Question(flow, problem, polish=polish), None)
     states, info = iterate((states, own), shared, 0, descent + LONGEST)
     done = states.polish
