@@ -1,4 +1,7 @@
-"""Dataclasses as pytrees, such that two classes are never taken for one another."""
+"""Dataclasses as pytrees, such that two classes are never taken for one another.
+
+Trees that go to a device and back go as one vector where it matters (`packed`).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 Static: dict[str, Any] = {"static": True}
 """Metadata of a field that is part of the structure, not a leaf: `field(metadata=Static)`."""
@@ -67,3 +72,27 @@ def with_host_fields(node: Node, like: Node) -> Node:
         elif is_dataclass(mine) and type(mine) is type(other):
             object.__setattr__(new, field.name, with_host_fields(mine, other))
     return new
+
+
+def packed(tree: Any, dtype: Any, xp: Any = jnp) -> Any:
+    """All numbers of a tree in one vector, so that one copy brings them to or from a device.
+
+    Args:
+        tree: of arrays or numbers, which that type can hold.
+        dtype: of the vector.
+        xp: jax.numpy or numpy, which makes it.
+    """
+    leaves = [xp.ravel(xp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(tree)]
+    return xp.concatenate(leaves)
+
+
+def unpacked(vector: Any, like: Any) -> Any:
+    """What was `packed`, with the structure, shapes and types of `like`."""
+    leaves, tree = jax.tree.flatten(like)
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    ends = np.cumsum([leaf.size for leaf in leaves]).tolist()
+    parts = [
+        vector[end - leaf.size : end].reshape(leaf.shape).astype(leaf.dtype)
+        for leaf, end in zip(leaves, ends, strict=True)
+    ]
+    return jax.tree.unflatten(tree, parts)

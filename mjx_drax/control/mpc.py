@@ -53,7 +53,7 @@ from mjx_drax.base.errors import (
     shown,
 )
 from mjx_drax.base.numbers import numbers
-from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.base.pytrees import packed, register_dataclass, unpacked
 from mjx_drax.control.open_quantities import (
     Applied,
     at_present,
@@ -155,7 +155,6 @@ class Now(NamedTuple):
         iterations: of every chain.
         noise: unit of the explorers' noise, the root of the last plan's cost.
         passed: time since the policy began [s].
-        data: the problem's, of the knots from t on.
         before: the control that was applied last (nu,), and whether there is one; None without
             rates.
     """
@@ -166,7 +165,6 @@ class Now(NamedTuple):
     iterations: Any
     noise: Any
     passed: Any
-    data: Any
     before: Any
 
 
@@ -325,9 +323,10 @@ class MPC:
         settings = self._flow, self._heated, self._polish, problem
         leaves, structure = jax.tree.flatten(settings)
         self._settings = jax.device_put(leaves)
-        self.planner = _planner(structure, self.explorers)
         carried = _first(found.chains, self.explorers, self.seed, self._polish)
         self._plan = None
+        self.planner = _planner(structure, self.explorers)
+        self._like = _plan_like(carried.state)
         with rarely_collected():
             self._apply(carried, x, t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
@@ -415,14 +414,16 @@ class MPC:
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
         """Plan in one launch, and use it if it is finite."""
         self._time = t  # of what is carried; the plan in use is older after one that failed
-        self._carried, device = self.planner(self._settings, carried, self._now(x, t, by))
-        plan: Plan = replace(jax.device_get(device), time=t)
+        now, data = self._now(x, t, by)
+        packet = packed(now, now.x.dtype, np)
+        self._carried, device = self.planner(self._settings, carried, packet, data)
+        plan: Plan = replace(unpacked(np.asarray(device), self._like), time=t)
         if plan.finite or self._plan is None:
             self._plan = plan
         return plan
 
-    def _now(self, x: ArrayLike, t: float, by: float) -> Now:
-        """What the next plan starts from, in the problem's precision."""
+    def _now(self, x: ArrayLike, t: float, by: float) -> tuple[Now, Any]:
+        """What the next plan starts from, in the problem's precision; data of its knots."""
         dynamics, number = self.problem.dynamics, np.asarray(self.problem.x_init).dtype.type
         moved = self.problem if self.problem.data is None else self.problem.at_time(t)
         cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
@@ -431,16 +432,16 @@ class MPC:
             v = self._applied.before(t, self._step).astype(number)
             before = v[: dynamics.nu], np.bool_(self._applied.any)
             whole[len(whole) - len(v) :] = v
-        return Now(
+        now = Now(
             x=whole,
             t=number(t),
             by=number(by),
             iterations=np.int32(self.iterations),
             noise=number(np.sqrt(max(cost, 1e-12))),
             passed=number(t - self._began),
-            data=moved.data,
             before=before,
         )
+        return now, moved.data
 
     def _begin(self, t: float) -> None:
         """Forget what was applied; a free duration begins at time t [s]."""
@@ -542,17 +543,57 @@ def _planner(structure: Any, explorers: int) -> compiled:
     """The program that plans with settings of this structure (flow, heated flow, polish, problem).
 
     A call gives their leaves, so that no plan waits while settings and problem are flattened and
-    their structure is compared.
+    their structure is compared; what is `Now` in one vector; and the problem's data of the knots
+    from now on. The plan comes back in one vector, too.
     """
 
-    def plan(leaves: list[Any], carried: Carried, now: Now) -> tuple[Carried, Plan]:
+    def plan(
+        leaves: list[Any], carried: Carried, packet: Array, data: Any
+    ) -> tuple[Carried, Array]:
         flow, heated, polish, problem = jax.tree.unflatten(structure, leaves)
+        now: Now = unpacked(packet, _now_like(problem))
         heated = replace(heated, scale=replace(heated.scale, noise=now.noise))
         present = at_present(problem, now.passed, now.before)
-        present = replace(present, x_init=now.x, t_init=now.t, data=now.data)
-        return _plan(flow, heated, polish, present, carried, now.by, now.iterations, explorers)
+        present = replace(present, x_init=now.x, t_init=now.t, data=data)
+        after, plan = _plan(
+            flow, heated, polish, present, carried, now.by, now.iterations, explorers
+        )
+        return after, packed(plan, packet.dtype)
 
-    return compiled(full_precision(plan))
+    return compiled(full_precision(plan), graph=True)
+
+
+def _now_like(problem: Problem) -> Now:
+    """Zeros of the shapes and types of what a plan of that problem starts from."""
+    dynamics, number = problem.dynamics, np.zeros((), problem.x_init.dtype)
+    rates = isinstance(dynamics, Extended) and dynamics.order
+    return Now(
+        x=np.zeros(dynamics.nx, number.dtype),
+        t=number,
+        by=number,
+        iterations=np.zeros((), np.int32),
+        noise=number,
+        passed=number,
+        before=(np.zeros(dynamics.nu, number.dtype), np.zeros((), bool)) if rates else None,
+    )
+
+
+def _plan_like(state: State) -> Plan:
+    """Zeros of the shapes and types of a plan, for chains in that state."""
+    knots, (K, nu, ndx) = state.trajectory, state.gains.shape[1:]
+    number = np.zeros((), knots.u.dtype)
+    no = np.zeros((), bool)
+    return Plan(
+        x=np.zeros((K + 1, knots.x.shape[-1]), number.dtype),
+        u=np.zeros((K, nu), number.dtype),
+        gains=np.zeros((K, nu, ndx), number.dtype),
+        cost=number,
+        max_defect=number,
+        finite=no,
+        switched=no,
+        dt=number,
+        time=0.0,
+    )
 
 
 def _plan(

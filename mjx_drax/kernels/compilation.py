@@ -24,6 +24,13 @@ time that a contact model compiles. On the CPU LLVM's full effort takes up to al
 long (a quadrotor's 103 s, not 37). Solves are as fast without."""
 
 
+GRAPH: dict[str, str | bool] = {
+    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUBLASLT,CUSTOM_CALL,CUDNN,"
+    "DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
+}
+"""For a GPU's program that a host waits for in a loop: XLA makes CUDA graphs of loops and branches,
+too, so the host launches one of them, and not hundreds of kernels."""
+
 QUICKLY: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
 """For a CPU's program that runs once: it compiles faster, and runs slower."""
 
@@ -62,15 +69,22 @@ def run_once(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 @lru_cache
-def known_options() -> dict[str, str | bool] | None:
-    """Options for the present backend, if its compiler knows them and JAX is not told to hurry."""
+def known_options(graph: bool = False) -> dict[str, str | bool] | None:
+    """Options for the present backend, if its compiler knows them and JAX is not told to hurry.
+
+    Args:
+        graph: whether with `GRAPH` on a GPU.
+    """
     if jax.config.values["jax_disable_most_optimizations"]:
         return None
-    options = OPTIONS.get(jax.default_backend())
+    backend = jax.default_backend()
+    options = OPTIONS.get(backend)
+    if graph and backend == "gpu":
+        options = {**(options or {}), **GRAPH}
     try:
         jax.jit(lambda x: x + 1, compiler_options=options)(0)
     except jax.errors.JaxRuntimeError:
-        return None
+        return known_options() if graph else None
     return options
 
 
@@ -129,16 +143,17 @@ class compiled:
     """`jax.jit` with options for the compiler, for functions that no other jitted one calls.
 
     Nothing is looked up before the first call: asking for the backend is what starts it, and
-    `jax.distributed.initialize` has to come first.
+    `jax.distributed.initialize` has to come first. With `graph` see `GRAPH`.
     """
 
-    def __init__(self, function: Callable[..., Any], **settings: Any) -> None:
-        self._function, self._settings = function, settings
+    def __init__(self, function: Callable[..., Any], graph: bool = False, **settings: Any) -> None:
+        self._function, self._graph, self._settings = function, graph, settings
         update_wrapper(self, function)
 
     @cached_property
     def _jitted(self) -> Any:
-        return jax.jit(self._function, compiler_options=known_options(), **self._settings)
+        options = known_options(graph=True) if self._graph else known_options()
+        return jax.jit(self._function, compiler_options=options, **self._settings)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""

@@ -3,10 +3,12 @@
 from dataclasses import dataclass, field
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mjx_drax import Projection, Reflection
-from mjx_drax.base.pytrees import Static, register_dataclass
+from mjx_drax.base.pytrees import Static, packed, register_dataclass, unpacked
 from mjx_drax.problem.cost import as_partial
 from mjx_drax.problem.dynamics import FunctionDynamics
 
@@ -75,6 +77,20 @@ def test_leaves_have_the_names_of_their_fields_and_make_the_same_object_again():
     ]
     assert jax.tree.unflatten(structure, [leaf for _, leaf in leaves]) == node
     assert jax.tree.map(lambda leaf: 2 * leaf, node) == One(2.0, 2, (6.0, 8.0))
+
+
+@pytest.mark.parametrize("to", [np, jnp])
+def test_a_tree_comes_back_from_one_vector(to):
+    like = One(np.zeros((2, 3), np.float32), 5, (np.zeros((), bool), np.zeros(1, np.int32)))
+    node = One(np.arange(6.0).reshape(2, 3), 5, (True, -7))
+    vector = packed(node, np.float32, to)
+    assert vector.dtype == np.float32
+    np.testing.assert_array_equal(vector, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 1.0, -7.0])
+    back = unpacked(vector, like)
+    assert jax.tree.structure(back) == jax.tree.structure(like)
+    for one, other, before in zip(*map(jax.tree.leaves, (back, like, node)), strict=True):
+        assert (one.dtype, one.shape) == (other.dtype, other.shape)
+        np.testing.assert_array_equal(np.ravel(one), np.ravel(before))
 
 
 @pytest.mark.slow

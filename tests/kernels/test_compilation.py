@@ -41,6 +41,21 @@ def test_the_compiler_gets_options_that_it_knows(monkeypatch, backend):
     assert given == [settings]
 
 
+def test_a_program_that_is_waited_for_becomes_a_graph_on_gpus(monkeypatch):
+    assert compilation.known_options(graph=True) == compilation.OPTIONS["cpu"]
+    compilation.known_options.cache_clear()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    options = compilation.OPTIONS["gpu"] | compilation.GRAPH
+    assert compilation.known_options(graph=True) == options
+    given, plain = [], jax.jit
+    monkeypatch.setattr(jax, "jit", lambda f, **rest: given.append(rest) or plain(f, **rest))
+    assert compiled(doubled, graph=True)(3.0) == 6.0
+    assert given == [{"compiler_options": options}]
+    compilation.known_options.cache_clear()
+    monkeypatch.setitem(compilation.GRAPH, "xla_gpu_enable_command_buffer", "NO_SUCH_COMMAND")
+    assert compilation.known_options(graph=True) == compilation.OPTIONS["gpu"]
+
+
 def test_garbage_is_looked_for_less_often_for_a_while():
     usual = gc.get_threshold()
     seen = []
