@@ -213,6 +213,8 @@ def solve_batch(
         seed: of all random numbers; problem i gets the same ones whatever is solved beside it.
         solver: `Restarts()` by default.
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
+            With 2,048 chains in it and more, the last ones that move go on in a smaller program,
+            which compiles beside the large one.
         progress: as in `solve`; a function is called with (problems done, of how many) after every
             chunk.
         devices: how many of this process to spread a chunk over, evenly; see `solve`.
