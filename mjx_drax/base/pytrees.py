@@ -77,6 +77,8 @@ def with_host_fields(node: Node, like: Node) -> Node:
 def packed(tree: Any, dtype: Any, xp: Any = jnp) -> Any:
     """All numbers of a tree in one vector, so that one copy brings them to or from a device.
 
+    `jax.flatten_util.ravel_pytree` would unpack them on the device, array by array.
+
     Args:
         tree: of arrays or numbers, which that type can hold.
         dtype: of the vector.

@@ -80,7 +80,7 @@ def known_options(graph: bool = False) -> dict[str, str | bool] | None:
     backend = jax.default_backend()
     options = OPTIONS.get(backend)
     if graph and backend == "gpu":
-        options = {**(options or {}), **GRAPH}
+        options = OPTIONS["gpu"] | GRAPH
     try:
         jax.jit(lambda x: x + 1, compiler_options=options)(0)
     except jax.errors.JaxRuntimeError:

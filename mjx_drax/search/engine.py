@@ -265,18 +265,20 @@ class Search:
         if not self.few or len(state.alive) < self.size * self.chains:
             return self._iterated(state, 0, 0)[1]
         with ThreadPoolExecutor(1) as pool:
-            second = pool.submit(self._compile_second, state, jnp.result_type(float))
+            wide = jnp.result_type(float) == jnp.float64
+            device = jax.config.values["jax_default_device"]
+            second = pool.submit(self._compile_second, state, wide, device)
             _, info = self._iterated(state, 0, 0)
             second.result()
         return info
 
-    def _compile_second(self, state: State, dtype: Any) -> None:
+    def _compile_second(self, state: State, wide: bool, device: Any) -> None:
         """Compile the program for few problems, and what begins and ends with it."""
-        with jax.enable_x64(dtype == jnp.float64):  # threads do not inherit it
+        with jax.enable_x64(wide), jax.default_device(device):  # threads do not inherit them
             knots, keys = self._drawn(0, np.arange(self.few))
             rows, (shared, own) = np.arange(len(keys)), self.question
             begin(taken(own, rows), shared, replace(knots, slack=None), keys)
-            nothing = Info.of(np.zeros(len(state.alive), dtype))
+            nothing = Info.of(np.zeros(len(state.alive)))
             self._go_on(state, nothing, rows, 0, 0)
 
     def _begun(self, attempt: int, knots: Trajectory, keys: Array) -> State:
@@ -306,7 +308,7 @@ class Search:
     def _begin_chunk(self) -> None:
         """New initial knots and random numbers for every row."""
         stage, indices = self.stage, self.indices
-        owners = np.tile(np.arange(self.chains), self.size)
+        owners = np.tile(np.arange(self.chains), len(indices))
         if stage.attempt > 0:
             assert stage.kept is not None
             assert self.settings.done_share is not None

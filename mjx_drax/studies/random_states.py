@@ -27,6 +27,7 @@ from jax import Array
 from jax.scipy.ndimage import map_coordinates
 
 from mjx_drax import tasks
+from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.solution.batch import BatchSolution, solve_batch
@@ -118,6 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=2, metavar="S")
     parser.add_argument("--attempts", type=int, default=5, metavar="A", help="at most; default 5")
     options = parser.parse_args(arguments)
+    try:
+        for name in ("states", "seeds", "attempts"):
+            require_whole(f"--{name}", getattr(options, name))
+        for chains in options.chains:
+            require_whole("--chains", chains)
+    except DraxError as error:
+        parser.error(str(error))
     problem = tasks.load("pendulum").make()
     x = np.random.default_rng(0).uniform(-4, 4, (options.states, 2)).astype(np.float32)
     grid = f"{ANGLES[1]} x {VELOCITIES[1]} states"
