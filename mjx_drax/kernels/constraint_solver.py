@@ -27,7 +27,6 @@ import numpy as np
 from jax import Array, lax
 
 from mjx_drax.kernels import elliptic_cones as elliptic
-from mjx_drax.kernels import positive_matrices
 from mjx_drax.kernels.batching import (
     block_for_each_row,
     merged_vmaps,
@@ -35,17 +34,8 @@ from mjx_drax.kernels.batching import (
     on_gpu,
     repeated,
 )
-from mjx_drax.kernels.linalg import cholesky, solve, symmetric
-from mjx_drax.kernels.riccati_blocks import (
-    LEAST,
-    SPLIT,
-    padded,
-    product,
-    swept,
-    tile,
-    times,
-    transposed_times,
-)
+from mjx_drax.kernels.linalg import solve_positive, symmetric
+from mjx_drax.kernels.tiles import LEAST, padded, products, swept, tile, times, transposed_times
 
 ITERATIONS, SIZES = 20, 16
 """Most iterations, and how many step sizes each chooses from, 1, 1/2, 1/4, ..., and one between."""
@@ -165,14 +155,16 @@ def _line(
 
 
 def iterated(
-    given: Constraints, product: Callable[..., Array], newton: Callable[..., Any], left: Any
+    given: Constraints,
+    product: Callable[..., Array],
+    newton: Callable[[Array, Array], Array],
+    keeps: bool,
 ) -> tuple[Array, Any]:
-    """The minimum (nv,), and what the last iteration left of its Hessian there.
+    """The minimum (nv,), and if it `keeps` it, the Hessian of the last iteration, else None.
 
     Args:
         product: of two matrices.
-        newton: newton(H, g) -> H^{-1} g, and what is left of H.
-        left: an array like what is left, or None.
+        newton: newton(H, g) -> H^{-1} g.
     """
     M, a0 = given.M, given.a0
     eps, sizes = jnp.finfo(a0.dtype).eps, jnp.exp2(-lax.iota(jnp.int32, SIZES).astype(a0.dtype))
@@ -184,7 +176,8 @@ def iterated(
         push, at = _forces(given, y)
         pull = pulled(given, push)
         gradient = rest - pull
-        direction, left = newton(hessian(given, y, product), gradient)
+        H = hessian(given, y, product)
+        direction = newton(H, gradient)
         turns = _turned(given, direction)
         along = direction, times(M, direction), *turns
         first, second = jnp.sum(gradient * direction), jnp.sum(direction * along[1])
@@ -207,11 +200,11 @@ def iterated(
         size = jnp.where(-least > lost, size, 0.0)
         unfinished = -least > jnp.maximum(lost, (DIGITS * eps) ** 2 * jnp.sum(here[0] * rest))
         moved = (a - size * d for a, d in zip(here, along, strict=True))
-        return count + 1, unfinished, *moved, 0.0 * least, left
+        return count + 1, unfinished, *moved, 0.0 * least, H if keeps else None
 
-    none = jnp.zeros_like(a0)
+    none, kept = jnp.zeros_like(a0), M if keeps else None
     # Without a number that is carried on, the compiler of kernels crashes; this one stays 0
-    begin = 0, True, none, none, *excess(given, a0), jnp.zeros((), a0.dtype), left
+    begin: Any = 0, True, none, none, *excess(given, a0), jnp.zeros((), a0.dtype), kept
     end = lax.while_loop(lambda c: (c[0] < ITERATIONS) & c[1], iteration, begin)
     return a0 + end[2], end[-1]
 
@@ -229,11 +222,8 @@ def _where_flat(sizes: Array, slopes: Array, slope: Array) -> Array:
 
 
 def _plain(given: Constraints) -> tuple[Array, Array]:
-    def newton(H: Array, gradient: Array) -> tuple[Array, Array]:
-        factor = cholesky(symmetric(H))
-        return solve(factor, gradient), factor
-
-    return iterated(given, jnp.matmul, newton, jnp.zeros_like(given.M))
+    a, H = iterated(given, jnp.matmul, solve_positive, keeps=True)
+    return a, symmetric(H)
 
 
 def _hessian_at(given: Constraints, a: Array) -> Array:
@@ -253,16 +243,14 @@ def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Ar
 
     def kernel(given: Constraints) -> tuple[Array, Array]:
         a = minima(given)
-        H = jax.vmap(_hessian_at)(given, a)
-        small = nv <= positive_matrices.MAX_SIZE
-        return a, positive_matrices.factors(H) if small else jax.vmap(cholesky)(H)
+        return a, jax.vmap(_hessian_at)(given, a)
 
     found: tuple[Array, Array] = lax.platform_dependent(given, cuda=kernel, default=plain)
     return found
 
 
 constrained_minimum = merged_vmaps(_plain, _all_rows)
-"""The acceleration (nv,), and the lower Cholesky factor of the Hessian there, (nv, nv)."""
+"""The acceleration (nv,), and the Hessian there, (nv, nv)."""
 
 
 def minima(given: Constraints, interpret: bool = False) -> Array:
@@ -271,8 +259,7 @@ def minima(given: Constraints, interpret: bool = False) -> Array:
     tiles = jax.tree.map(lambda a: padded(a, *map(tile, a.shape[1:])), given._replace(cones=()))
     tiles = tiles._replace(cones=tuple(_tiles(cones, tile(n)) for cones in given.cones))
     arrays, tree = jax.tree.flatten(tiles)
-    precision = lax.Precision.HIGHEST if interpret else SPLIT
-    body = partial(_body, n, tree, partial(product, precision=precision))
+    body = partial(_body, n, tree, products(interpret))
     warps = 1 if _rows(given) <= MOST_OF_ONE_WARP else 4
     shapes = {"a": tiles.a0.shape}
     return block_for_each_row(body, shapes, arrays, warps, interpret)["a"][:, :n]
@@ -301,7 +288,7 @@ def _body(n: int, tree: Any, product: Callable[..., Array], *refs: Any) -> None:
     *inputs, out = refs
     given: Constraints = jax.tree.unflatten(tree, [ref[0] for ref in inputs])
 
-    def newton(H: Array, gradient: Array) -> tuple[Array, None]:
-        return -times(swept(H, n), gradient), None
+    def newton(H: Array, gradient: Array) -> Array:
+        return -times(swept(H, n), gradient)
 
-    out[0], _ = iterated(given, product, newton, None)
+    out[0], _ = iterated(given, product, newton, keeps=False)

@@ -125,7 +125,7 @@ def solve_positive(matrix: Array, b: Array) -> Array:
     """
     if matrix.shape[-1] <= UNROLLED_UP_TO:
         return solve(cholesky(matrix), b)
-    return _solve_positive(matrix, b)
+    return solve_implicitly(matrix, b)
 
 
 def _positive_solution(matrix: Array, b: Array) -> Array:
@@ -136,7 +136,7 @@ def _positive_solutions(has_rows: Sequence[bool], *arguments: Array) -> Array:
     """`_positive_solution` of many rows, by one kernel on GPUs where one is made for it."""
     M, b = repeated(has_rows, arguments)
     plain = jax.vmap(_positive_solution)
-    if not (on_gpu() and M.shape[-1] <= positive_matrices.MAX_SIZE and of_one_precision((M, b))):
+    if not (on_gpu() and of_one_precision((M, b)) and positive_matrices.fits(M)):
         return plain(M, b)
 
     def kernel(M: Array, b: Array) -> Array:
@@ -146,11 +146,12 @@ def _positive_solutions(has_rows: Sequence[bool], *arguments: Array) -> Array:
     return found
 
 
-_solve_positive = jax.custom_jvp(merged_vmaps(_positive_solution, _positive_solutions))
+solve_implicitly = jax.custom_jvp(merged_vmaps(_positive_solution, _positive_solutions))
+"""`solve_positive`, with derivatives of the equation, and a kernel on GPUs, at all sizes."""
 
 
-@_solve_positive.defjvp
-def _solve_positive_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> Any:
+@solve_implicitly.defjvp
+def _solve_implicitly_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> Any:
     (matrix, b), (dM, db) = primals, tangents
     factor = cholesky(matrix)
     y = solve(factor, b)

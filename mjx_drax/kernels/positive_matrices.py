@@ -1,8 +1,9 @@
-"""Cholesky factors and solutions of many matrices of middle size: a thread of a GPU for each.
+"""Equations of many positive definite matrices of middle size, by one kernel on GPUs.
 
-Libraries take a dozen launches for a batch of Cholesky factors, and blocks of threads that wait for
-each other. XLA's fused loops compute every entry of an unrolled factor by itself, with all that it
-depends on. Here a factor stays in the registers of one thread, unrolled into scalars.
+Libraries take a dozen launches for the Cholesky factors of a batch and what follows from them. And
+XLA's fused loops compute every entry of an unrolled factor by itself, with all that it depends on.
+Here the factor of a small matrix stays in the registers of one thread, unrolled into scalars; a
+larger one is inverted by a block of threads, as a tile.
 """
 
 from __future__ import annotations
@@ -10,35 +11,28 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-from mjx_drax.kernels import small_matrices
-from mjx_drax.kernels.batching import padded, thread_for_each_row
+from mjx_drax.kernels import small_matrices, tiles
+from mjx_drax.kernels.batching import block_for_each_row, padded, thread_for_each_row
 from mjx_drax.kernels.small_matrices import Matrix
 
 THREADS = 32
-"""Matrices that a block of threads works on: one warp."""
+"""Matrices that a block of threads works on, a thread for each: one warp."""
 
-MAX_SIZE = 12
-"""Largest matrices: kernels for 12 compile in seconds, those for 18 in a minute."""
+MOST_OF_ONE_THREAD, MOST = 12, 64
+"""Largest matrices of one thread, kernels for which compile in seconds, and those for 18 in a
+minute; and of a block of threads."""
+
+WARPS, COLUMNS = 2, 64
+"""Warps of a block of threads, and columns of b that it works on at a time."""
 
 
-def factors(M: Array, interpret: bool = False) -> Array:
-    """Lower triangular L, (rows, n, n), with L L' = M, of which lower triangles are read.
-
-    In plain JAX it is the vmap of `linalg.cholesky`.
-    """
-    rows, n, _ = M.shape
-
-    def body(M_ref: Any, out_ref: Any) -> None:
-        L = small_matrices.cholesky(_triangle(M_ref, n), lax.sqrt, lax.div)
-        for i in range(n):
-            for j in range(n):
-                out_ref[i * n + j, :] = L[i][j] if j <= i else jnp.zeros_like(L[0][0])
-
-    arrays = [_by_entries(_lower(M))]
-    found = thread_for_each_row(body, THREADS, (n * n,), arrays, interpret=interpret)
-    return found[:, :rows].T.reshape(M.shape)
+def fits(M: Array) -> bool:
+    """Whether there is a kernel for such matrices (..., n, n)."""
+    n = M.shape[-1]
+    return n <= MOST_OF_ONE_THREAD or (n <= MOST and M.dtype == np.float32)
 
 
 def solutions(M: Array, b: Array, interpret: bool = False) -> Array:
@@ -46,6 +40,33 @@ def solutions(M: Array, b: Array, interpret: bool = False) -> Array:
 
     In plain JAX it is the vmap of `linalg.solve_positive`.
     """
+    by = _by_threads if M.shape[-1] <= MOST_OF_ONE_THREAD else _by_blocks
+    return by(M, b, interpret)
+
+
+def _by_blocks(M: Array, b: Array, interpret: bool) -> Array:
+    """`solutions` from inverses, with one refinement."""
+    n, m = b.shape[1:]
+    N, columns = tiles.tile(n), tiles.tile(m)
+    chunk, product = min(columns, COLUMNS), tiles.products(interpret)
+
+    def body(M_ref: Any, b_ref: Any, x_ref: Any) -> None:
+        lower = M_ref[0]
+        row, column = tiles.indices(N)
+        M = jnp.where(row >= column, lower, lower.T)
+        inverse = -tiles.swept(M, n)
+        for start in range(0, columns, chunk):
+            b = b_ref[0, :, start : start + chunk]
+            x = product(inverse, b)
+            x_ref[0, :, start : start + chunk] = x + product(inverse, b - product(M, x))
+
+    arrays = tiles.padded(M, N, N), tiles.padded(b, N, columns)
+    found = block_for_each_row(body, {"x": arrays[1].shape}, arrays, WARPS, interpret)
+    return found["x"][:, :n, :m]
+
+
+def _by_threads(M: Array, b: Array, interpret: bool) -> Array:
+    """`solutions` from factors."""
     rows, n, m = b.shape
 
     def body(M_ref: Any, b_ref: Any, out_ref: Any) -> None:

@@ -9,7 +9,6 @@ threads. Elsewhere an associative scan does the same in about 2 log2(K) rounds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mjx_drax.kernels import riccati_blocks
+from mjx_drax.kernels import riccati_blocks, tiles
 from mjx_drax.kernels.batching import (
     block_for_each_row,
     merged_vmaps,
@@ -99,19 +98,17 @@ def by_threads(F: Array, f: Array, interpret: bool = False) -> Array:
 def by_blocks(F: Array, f: Array, interpret: bool = False) -> Array:
     """`affine_recursion` of many chains (chains, K, ...), a block of threads for each."""
     chains, K, n, m = f.shape
-    N, M = riccati_blocks.tile(n), riccati_blocks.tile(m)
-    precision = lax.Precision.HIGHEST if interpret else riccati_blocks.SPLIT
-    times = partial(riccati_blocks.product, precision=precision)
+    N, M, multiply = tiles.tile(n), tiles.tile(m), tiles.products(interpret)
 
     def body(F_ref: Any, f_ref: Any, x_ref: Any) -> None:
         def stage(k: Array, x: Array) -> Array:
-            x = times(F_ref[0, k], x) + f_ref[0, k]
+            x = multiply(F_ref[0, k], x) + f_ref[0, k]
             x_ref[0, k] = x
             return x
 
         lax.fori_loop(0, K, stage, jnp.zeros_like(f_ref[0, 0]))
 
-    arrays = riccati_blocks.padded(F, N, N), riccati_blocks.padded(f, N, M)
+    arrays = tiles.padded(F, N, N), tiles.padded(f, N, M)
     shapes: dict[str, tuple[int, ...]] = {"x": (chains, K, N, M)}
     found = block_for_each_row(body, shapes, arrays, riccati_blocks.WARPS, interpret)
     return found["x"][..., :n, :m]

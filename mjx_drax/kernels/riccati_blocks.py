@@ -1,13 +1,7 @@
 """The Riccati recursion of `method.riccati` as two GPU kernels: a block of threads for each chain.
 
-For blocks too large for the registers of one thread (`riccati_gpu`). Matrices are tiles of the
-next powers of two, so that the block multiplies and adds whole tiles. Where the method factorizes,
-the kernel inverts S / mu and Quu, by sweeps: a sweep of k does for all i, j not k
-
-    T_ij <- T_ij - T_ik T_kj / T_kk     T_ik <- T_ik / T_kk     T_kk <- -1 / T_kk
-
-and after all of them T holds -T^{-1}. It stays symmetric, and needs one column at a time. The
-pivots T_kk are positive if and only if T is positive definite; else the result is not a number.
+For blocks too large for the registers of one thread (`riccati_gpu`). Matrices are `tiles`. Where
+the method factorizes, the kernel inverts S / mu and Quu, by sweeps.
 """
 
 from __future__ import annotations
@@ -21,15 +15,22 @@ from jax import Array, lax
 
 from mjx_drax.kernels.batching import block_for_each_row
 from mjx_drax.kernels.linalg import cholesky, solve_upper
+from mjx_drax.kernels.tiles import (
+    diagonal,
+    padded,
+    products,
+    swept,
+    symmetric,
+    tile,
+    times,
+    transposed_times,
+)
 
-LEAST, MAX_NDX, MAX_NU = 16, 64, 32
-"""The least tile of tensor cores, and the largest blocks: beyond, registers do not hold them."""
+MAX_NDX, MAX_NU = 64, 32
+"""The largest blocks: beyond, registers do not hold them."""
 
 WARPS = 4
 """Warps of 32 threads that work on a chain: more of them wait for each other longer."""
-
-SPLIT = lax.DotAlgorithmPreset.TF32_TF32_F32_X3
-"""Products on tensor cores, of factors in two parts: as exact as float32, and fewer registers."""
 
 
 def newton_steps(
@@ -62,7 +63,7 @@ def newton_steps(
         full = {k: (chains, K, *s) for k, s in shapes.items()}
         return block_for_each_row(body, full, arrays, WARPS, interpret)
 
-    multiply = partial(product, precision=lax.Precision.HIGHEST if interpret else SPLIT)
+    multiply = products(interpret)
     shapes = {"K": (M, N), "kff": (M,), "Q": (M, M), "T": (N, N), "P": (N, N), "p": (N,)}
     given = soft, A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu
     left = launch(partial(backward, K, n, m, multiply), shapes, *given)
@@ -90,15 +91,17 @@ def backward(horizon: int, n: int, m: int, product: Any, *refs: Any) -> None:
     """`method.riccati.factorize` of one chain, with inverses for factors."""
     soft, A, B, h, multipliers, gx, gu, Hxx, Hux, Huu = refs[:10]
     gains, offsets, of_u, inverses, values, slopes = refs[10:]
-    s = soft[0, 0]
+    s, identity = soft[0, 0], diagonal(Hxx.shape[-1], Hxx.dtype)
+
+    def softened(P: Array) -> tuple[Array, Array]:
+        T = -swept(identity + s * P, n)
+        return T, symmetric(product(T, P))
 
     def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         P, p = carry
         k = horizon - 1 - i
         a, b = A[0, k], B[0, k]
-        T = diagonal(P.shape[0], P.dtype) + s * P
-        T = lax.cond(s == 0.0, lambda T: T, lambda T: -swept(T, n), T)
-        relaxed = symmetric(product(T, P))
+        T, relaxed = lax.cond(s == 0.0, lambda P: (identity, P), softened, P)
         slope = times(relaxed, h[0, k]) + times(T, p + s * times(P, multipliers[0, k]))
         PA, PB = product(relaxed, a), product(relaxed, b)
         Qux, Quu = Hux[0, k] + product(b.T, PA), Huu[0, k] + product(b.T, PB)
@@ -139,64 +142,3 @@ def forward(horizon: int, *refs: Any) -> None:
 
     zero = jnp.zeros_like(h[0, 0])
     lax.fori_loop(0, horizon, stage, (zero, zero) if noisy else (zero,))
-
-
-def swept(T: Array, count: int) -> Array:
-    """T after sweeps of its first `count` rows; see above."""
-    rows, columns = indices(T.shape[0])
-
-    def sweep(k: Array, T: Array) -> Array:
-        of_column = columns == k
-        column = jnp.sum(jnp.where(of_column, T, 0.0), axis=1)
-        pivot = jnp.sum(jnp.where(jnp.arange(T.shape[0]) == k, column, 0.0))
-        scaled = column / jnp.where(pivot > 0.0, pivot, jnp.nan)
-        inner = T - column[:, None] * scaled[None, :]
-        border = jnp.where(of_column, scaled[:, None], scaled[None, :])
-        there = of_column | (rows == k)
-        corner = of_column & (rows == k)
-        return jnp.where(corner, -1.0 / pivot, jnp.where(there, border, inner))
-
-    return lax.fori_loop(0, count, sweep, T)
-
-
-def indices(n: int) -> tuple[Array, Array]:
-    """The row and the column of every entry of a tile (n, n)."""
-    return lax.broadcasted_iota(jnp.int32, (n, n), 0), lax.broadcasted_iota(jnp.int32, (n, n), 1)
-
-
-def diagonal(n: int, dtype: Any) -> Array:
-    """The identity."""
-    rows, columns = indices(n)
-    return jnp.where(rows == columns, jnp.ones((), dtype), jnp.zeros((), dtype))
-
-
-def product(A: Array, B: Array, precision: Any) -> Array:
-    """A B."""
-    return jnp.dot(A, B, precision=precision)
-
-
-def times(A: Array, v: Array) -> Array:
-    """A v."""
-    return jnp.sum(A * v[None, :], axis=1)
-
-
-def transposed_times(A: Array, v: Array) -> Array:
-    """A'v."""
-    return jnp.sum(A * v[:, None], axis=0)
-
-
-def symmetric(A: Array) -> Array:
-    """1/2 (A + A')."""
-    return 0.5 * (A + A.T)
-
-
-def tile(n: int) -> int:
-    """The size of the tile for blocks of n rows."""
-    return max(LEAST, 1 << (n - 1).bit_length())
-
-
-def padded(a: Array, *sizes: int) -> Array:
-    """Blocks (..., *shape) with zeros around, up to `sizes`."""
-    leading = a.ndim - len(sizes)
-    more = [size - there for size, there in zip(sizes, a.shape[leading:], strict=True)]
-    return jnp.pad(a, [(0, 0)] * leading + [(0, by) for by in more])

@@ -37,7 +37,7 @@ from mjx_drax.kernels.constraint_solver import (
     pulled,
 )
 from mjx_drax.kernels.elliptic_cones import Cones
-from mjx_drax.kernels.linalg import cholesky, product, solve, solve_positive, symmetric
+from mjx_drax.kernels.linalg import product, solve_implicitly, solve_positive, symmetric
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import internal, mjx, with_internal
 from mjx_drax.physics.contacts.collision import collision, make_data
@@ -161,7 +161,7 @@ def _forces(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Array, Array
 
 
 def _solution(model: mjx.Model, data: mjx.Data) -> tuple[Array, Array]:
-    """The acceleration under constraints (nv,), and the factor of H there; without derivatives."""
+    """The acceleration under constraints (nv,), and H there, (nv, nv); without derivatives."""
     return constrained_minimum(_constraints(*jax.lax.stop_gradient((model, data))))
 
 
@@ -197,11 +197,11 @@ def _constrained(
     """`data` with the acceleration and the forces under constraints, and if asked, derivatives."""
     if internal(data).efc_J.size == 0:
         return data.replace(qacc=data.qacc_smooth)
-    qacc, factor = solution or _solution(model, data)
+    qacc, H = solution or _solution(model, data)
     M = internal(data).M
     if derivatives:
         pull = _forces(model, data, qacc)[1]
-        qacc = qacc - solve(factor, M @ qacc - data.qfrc_smooth - pull)
+        qacc = qacc - solve_positive(H, M @ qacc - data.qfrc_smooth - pull)
     data = data.replace(qacc=qacc, qfrc_constraint=M @ qacc - data.qfrc_smooth)
     return with_internal(data, efc_force=_forces(model, data, qacc)[0])
 
@@ -253,7 +253,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     data = _smooth(model, start)
     placed, held = data, has_constraints(model)
     M = internal(data).M
-    solution = _solution(model, data) if held else (data.qacc_smooth, cholesky(M))
+    solution = _solution(model, data) if held else (data.qacc_smooth, M)
     data = _constrained(model, data, solution)
     a, b, explicit = data.qacc, _implicit(model, data), _explicit(model)
 
@@ -293,7 +293,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     left, rates, later = jnp.split(jnp.concatenate(columns, axis=1), ends)
     bias_by_q, bias_by_v, more_by_q = inverse_derivatives(model, data, a, b - a)
     left = left.at[:, : 2 * model.nv].add(jnp.concatenate([bias_by_q, bias_by_v], axis=1))
-    d = -solve(solution[1], left)
+    d = -(solve_implicitly if held else solve_positive)(solution[1], left)
     if not explicit:
         later = later.at[:, : model.nv].add(more_by_q)
         d = _solve_implicit(model, data, M @ d - later)

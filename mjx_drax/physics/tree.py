@@ -240,28 +240,35 @@ def inverse_derivatives(
         d tau_i / d v_j = s_i . (B s_j + I (s_j' + s_j*))                  B, I of i or j as above
 
     B_i, I_i and f_i are sums over all bodies that i moves: of the inertias I, of the matrices that
-    take m to v x (I m) - I (v x m) + m x (I v), and of the forces I a + v x (I v).
+    take m to v x (I m) - I (v x m) + m x (I v), and of the forces I a + v x (I v). With v = (w, u),
+    I = (J, c, mass) and I v = (n, p), of m only its turning m_w counts,
+
+        B m = (Z m_w - n x m_w, -2 p x m_w)      Z = Y + Y'      Y = [w]x J - c u' + (u . c) 1
     """
     sums, S, inertia, velocity = _Sums.of(model), data.cdof, internal(data).cinert, data.cvel
     moves, before, momentum = sums.moves, sums.before, _inertia_times(inertia, velocity)
     above = before + moves[np.asarray(model.dof_bodyid)] * (1 - before) * (1 - before.T)
 
-    def slope(unit: Array) -> Array:
-        """B m of each body for one m (6,)."""
-        m = jnp.broadcast_to(unit, velocity.shape)
-        own = _crossed_force(velocity, _inertia_times(inertia, m)) + _crossed_force(m, momentum)
-        return own - _inertia_times(inertia, _crossed(velocity, m))
-
-    slopes = jnp.concatenate([slope(unit) for unit in jnp.eye(6, dtype=S.dtype)], axis=1)
-    below = _summed(moves.T, jnp.concatenate([inertia, slopes], axis=1))
-    inertias, slopes = below[:, :10], below[:, 10:].reshape(-1, 6, 6)  # B_j: columns come first
-    moved, swept = _inertia_times(inertias, S), jnp.sum(slopes * S[:, None], axis=2)
+    (turn, move), off = jnp.split(velocity, 2, axis=1), inertia[:, 6:9]
+    Y = jnp.cross(turn[:, None], _tensors(inertia)) - off[:, :, None] * move[:, None]
+    Y = Y + jnp.sum(move * off, axis=1)[:, None, None] * jnp.eye(3)
+    Z = (Y + jnp.swapaxes(Y, 1, 2)).reshape(-1, 9)
+    below = _summed(moves.T, jnp.concatenate([inertia, Z, momentum], axis=1))
+    inertias, Z = below[:, :10], below[:, 10:19].reshape(-1, 3, 3)
+    twist, push = below[:, 19:22], below[:, 22:]
+    turning, moving = jnp.split(S, 2, axis=1)
+    moved = _inertia_times(inertias, S)
+    swept = _applied(Z, turning) - jnp.cross(turning, twist) - 2.0 * jnp.cross(moving, push)
 
     def derivative(first: Array, second: Array, force: Array) -> Array:
         """s_i . (B s_j' + I s_j'') for such columns (nv, 6), and forces of bodies (nbody, 6)."""
-        own = jnp.sum(slopes * first[:, :, None], axis=1) + _inertia_times(inertias, second)
-        own = own + _crossed_force(S, _summed(moves.T, force))
-        by_above = jnp.sum(swept[:, None] * first + moved[:, None] * second, axis=2)
+        turns = first[:, :3]
+        around = _applied(Z, turns) - jnp.cross(twist, turns)
+        own = jnp.concatenate([around, -2.0 * jnp.cross(push, turns)], axis=1)
+        own = own + _inertia_times(inertias, second) + _crossed_force(S, _summed(moves.T, force))
+        by_above = jnp.sum(swept[:, None] * turns, axis=2) + jnp.sum(
+            moved[:, None] * second, axis=2
+        )
         by_below = jnp.sum(S[:, None] * own, axis=2)
         return jnp.where(above > 0, by_above, 0.0) + jnp.where(before.T > 0, by_below, 0.0)
 
@@ -275,12 +282,14 @@ def inverse_derivatives(
     second = _crossed(world + _summed(before, motion), S)
     second = second + _crossed(_summed(before, S * speed), rate)
     behind = _crossed(_summed(above, S * speed), S)
-    push, none = S * more[:, None], jnp.zeros_like(S)
+    pushed, none = S * more[:, None], jnp.zeros_like(S)
     return (
         derivative(rate, second, force),
         derivative(S, rate + behind, jnp.zeros_like(force)),
         derivative(
-            none, _crossed(_summed(before, push), S), _inertia_times(inertia, _summed(moves, push))
+            none,
+            _crossed(_summed(before, pushed), S),
+            _inertia_times(inertia, _summed(moves, pushed)),
         ),
     )
 
@@ -320,10 +329,14 @@ def _summed(which: np.ndarray, rows: Array) -> Array:
     return jnp.sum(which[:, :, None].astype(rows.dtype) * rows, axis=1)
 
 
+def _tensors(inertia: Array) -> Array:
+    """The tensors J (n, 3, 3) of inertias (n, 10); mass times centre and mass are the others."""
+    return inertia[:, np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
+
+
 def _inertia_times(inertia: Array, motion: Array) -> Array:
     """Momenta (n, 6) of bodies with inertias (n, 10) in motions (n, 6)."""
-    whole = inertia[:, np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])]
-    off, mass = inertia[:, 6:9], inertia[:, 9:]
+    whole, off, mass = _tensors(inertia), inertia[:, 6:9], inertia[:, 9:]
     turning, moving = motion[:, :3], motion[:, 3:]
     angular = _applied(whole, turning) + jnp.cross(off, moving)
     return jnp.concatenate([angular, mass * moving - jnp.cross(off, turning)], axis=1)

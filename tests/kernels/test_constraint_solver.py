@@ -98,7 +98,7 @@ def test_cones_have_the_derivatives_and_the_changes_of_their_potential():
 
 
 @pytest.mark.slow
-def test_among_cones_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian():
+def test_among_cones_the_gradient_is_zero_and_the_hessian_is_that_of_what_is_minimized():
     given = drawn_with_cones()
 
     def least(given, a):
@@ -108,24 +108,24 @@ def test_among_cones_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian(
         contacts = sum(map(potential, given.cones, of_cones))
         return 0.5 * apart @ given.M @ apart + limits + contacts
 
-    a, factor = jax.jit(jax.vmap(constrained_minimum))(given)
+    a, H = jax.jit(jax.vmap(constrained_minimum))(given)
     slope, bent = (jax.vmap(d(least, 1))(given, a) for d in (jax.grad, jax.hessian))
     assert np.abs(slope).max() < 1e-4
-    np.testing.assert_allclose(factor @ factor.mT, bent, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(H, bent, rtol=1e-3, atol=1e-3)
 
 
 def gradient(given, a):
     return given.M @ (a - given.a0) - given.J.T @ law(given, given.J @ a - given.aref)[0]
 
 
-def test_the_gradient_is_zero_and_the_factor_is_that_of_the_hessian():
+def test_the_gradient_is_zero_and_the_hessian_is_that_of_what_is_minimized():
     given = drawn()
 
     @jax.jit
     @jax.vmap
     def checked(given):
-        a, factor = constrained_minimum(given)
-        return gradient(given, a), factor @ factor.T, jax.jacfwd(gradient, argnums=1)(given, a)
+        a, H = constrained_minimum(given)
+        return gradient(given, a), H, jax.jacfwd(gradient, argnums=1)(given, a)
 
     slope, seen, hessian = checked(given)
     assert np.abs(slope).max() < 1e-4
