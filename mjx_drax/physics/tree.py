@@ -266,9 +266,8 @@ def inverse_derivatives(
         around = _applied(Z, turns) - jnp.cross(twist, turns)
         own = jnp.concatenate([around, -2.0 * jnp.cross(push, turns)], axis=1)
         own = own + _inertia_times(inertias, second) + _crossed_force(S, _summed(moves.T, force))
-        by_above = jnp.sum(swept[:, None] * turns, axis=2) + jnp.sum(
-            moved[:, None] * second, axis=2
-        )
+        by_above = jnp.sum(swept[:, None] * turns, axis=2)
+        by_above = by_above + jnp.sum(moved[:, None] * second, axis=2)
         by_below = jnp.sum(S[:, None] * own, axis=2)
         return jnp.where(above > 0, by_above, 0.0) + jnp.where(before.T > 0, by_below, 0.0)
 

@@ -95,6 +95,11 @@ BLOCKED, RAISE = 0.1, 3.0
 LOOSE, STIFFER = 0.1, 10.0
 """Where a step leaves more than LOOSE of the constraints, their penalties grow by STIFFER."""
 
+KEPT, RAISED = 0.1, 1e3
+"""Where with eta = |lambda| a step would raise the merit function, eta grows, by at most RAISED,
+until the share KEPT of what the step takes from sum eta |h| is left. Exact and learned Hessians
+need it: they are positive definite only along the constraints (Nocedal and Wright, (18.36))."""
+
 MARGIN = 1e-2
 """Where the polish begins, knots keep this share of their range from its ends."""
 
@@ -386,7 +391,12 @@ def _moved(
         rates,
     )
     of_cost, of_defects = _promised(model, d, left, eta)
-    promised = of_cost - rho * _logs(ends, moves, reach), of_defects
+    of_cost = of_cost - rho * _logs(ends, moves, reach)
+    rises = (of_defects < 0.0) & (of_cost + of_defects >= 0.0)
+    enough = of_cost / jnp.where(rises, (KEPT - 1.0) * of_defects, 1.0)
+    more = jnp.where(rises, jnp.minimum(enough, RAISED), 1.0)
+    eta = jax.tree.map(lambda e: more * e, eta)
+    promised = of_cost, more * of_defects
     rows = Multipliers(scales.x, Stagewise(*row_scales(derivatives, scales, model.trajectory)))
     A, B = derivatives.dynamics.A, derivatives.dynamics.B
     ray = Ray(
