@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mjx_drax.kernels.batching import block_for_each_row
-from mjx_drax.kernels.linalg import cholesky, solve_upper
+from mjx_drax.kernels.linalg import cholesky, solve_upper, symmetric
 from mjx_drax.kernels.tiles import (
     diagonal,
     padded,
     products,
     swept,
-    symmetric,
     tile,
     times,
     transposed_times,

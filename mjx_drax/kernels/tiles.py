@@ -74,11 +74,6 @@ def transposed_times(A: Array, v: Array) -> Array:
     return jnp.sum(A * v[:, None], axis=0)
 
 
-def symmetric(A: Array) -> Array:
-    """1/2 (A + A')."""
-    return 0.5 * (A + A.T)
-
-
 def tile(n: int) -> int:
     """The size of the tile for blocks of n rows."""
     return max(LEAST, 1 << (n - 1).bit_length())

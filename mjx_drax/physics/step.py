@@ -293,6 +293,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     left, rates, later = jnp.split(jnp.concatenate(columns, axis=1), ends)
     bias_by_q, bias_by_v, more_by_q = inverse_derivatives(model, data, a, b - a)
     left = left.at[:, : 2 * model.nv].add(jnp.concatenate([bias_by_q, bias_by_v], axis=1))
+    # scalar arithmetic, for models without constraints, has to see the operations of a small one
     d = -(solve_implicitly if held else solve_positive)(solution[1], left)
     if not explicit:
         later = later.at[:, : model.nv].add(more_by_q)

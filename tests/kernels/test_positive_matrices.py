@@ -16,7 +16,7 @@ def drawn(rows, n, m):
 
 
 @pytest.mark.parametrize(
-    ("rows", "n", "m"), [(THREADS + 3, 9, 1), (2, 11, 4), (3, 17, 1), (2, 33, COLUMNS + 1)]
+    ("rows", "n", "m"), [(THREADS + 3, 9, 1), (2, 11, 4), (3, 17, 1), (2, MOST, COLUMNS + 1)]
 )
 def test_it_solves_the_equations(rows, n, m):
     with jax.enable_x64(True):
