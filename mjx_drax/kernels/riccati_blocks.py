@@ -42,7 +42,7 @@ def newton_steps(
     Hux: Array,
     Huu: Array,
     multipliers: Array,
-    penalty: Array,
+    penalty: Array | None = None,
     xi_u: Array | None = None,
     xi_e: Array | None = None,
     interpret: bool = False,
@@ -53,7 +53,7 @@ def newton_steps(
     """
     chains, K, n, m = B.shape
     N, M = tile(n), tile(m)
-    soft = (1.0 / penalty)[:, None]
+    soft = None if penalty is None else (1.0 / penalty)[:, None]
     A, Hxx = (padded(a, N, N) for a in (A, Hxx))
     B, Hux, Huu = padded(B, N, M), padded(Hux, M, N), padded(Huu, M, M)
     h, gx, multipliers = (padded(a, N) for a in (h, gx, multipliers))
@@ -63,10 +63,12 @@ def newton_steps(
         return block_for_each_row(body, full, arrays, WARPS, interpret)
 
     multiply = products(interpret)
-    shapes = {"K": (M, N), "kff": (M,), "Q": (M, M), "T": (N, N), "P": (N, N), "p": (N,)}
-    given = soft, A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu
-    left = launch(partial(backward, K, n, m, multiply), shapes, *given)
-    factors = [left[name] for name in ("K", "kff", "T", "P", "p")]
+    softness = [] if soft is None else [soft]
+    shapes = {"K": (M, N), "kff": (M,), "P": (N, N), "p": (N,), "Q": (M, M)}
+    shapes |= {} if soft is None else {"T": (N, N)}
+    given = A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu, *softness
+    left = launch(partial(backward, K, n, m, multiply, bool(softness)), shapes, *given)
+    factors = [left[name] for name in shapes if name != "Q"] + softness
     shapes = {"dx": (N,), "du": (M,), "rate": (N,)}
     white = []
     if xi_u is not None and xi_e is not None:
@@ -77,65 +79,73 @@ def newton_steps(
             return solve_upper(cholesky(Q[:m, :m]), xi_u), kicks
 
         over_stages = jax.vmap(colored, in_axes=(None, 0, 0, 0, 0))
-        of_u, of_x = jax.vmap(over_stages)(soft[:, 0], left["Q"], left["P"], xi_u, xi_e)
+        amounts = jnp.zeros(chains) if soft is None else soft[:, 0]
+        of_u, of_x = jax.vmap(over_stages)(amounts, left["Q"], left["P"], xi_u, xi_e)
         white = [padded(of_u, M), padded(of_x, N)]
         shapes |= {"noise_x": (N,), "noise_u": (M,)}
-    step = launch(partial(forward, K), shapes, soft, A, B, h, multipliers, *factors, *white)
+    program = partial(forward, K, bool(softness), bool(white))
+    step = launch(program, shapes, A, B, h, multipliers, *factors, *white)
     sizes = {"du": m, "noise_u": m}
     found = {name: a[..., : sizes.get(name, n)] for name, a in step.items()}
     return {"noise_x": None, "noise_u": None, **found, "gains": left["K"][..., :m, :n]}
 
 
-def backward(horizon: int, n: int, m: int, product: Any, *refs: Any) -> None:
+def backward(horizon: int, n: int, m: int, product: Any, soft: bool, *refs: Any) -> None:
     """`method.riccati.factorize` of one chain, with inverses for factors."""
-    soft, A, B, h, multipliers, gx, gu, Hxx, Hux, Huu = refs[:10]
-    gains, offsets, of_u, inverses, values, slopes = refs[10:]
-    s, identity = soft[0, 0], diagonal(Hxx.shape[-1], Hxx.dtype)
+    A, B, h, multipliers, gx, gu, Hxx, Hux, Huu, *rest = refs
+    s = rest.pop(0)[0, 0] if soft else None
+    gains, offsets, values, slopes, of_u, *inverses = rest
 
-    def softened(P: Array) -> tuple[Array, Array]:
-        T = -swept(identity + s * P, n)
-        return T, symmetric(product(T, P))
+    def relaxed(k: Array, P: Array, p: Array) -> tuple[Array, Array]:
+        """P~ and p~; T = mu S^{-1} is kept."""
+        if s is None:
+            return P, p
+        T = -swept(diagonal(P.shape[0], P.dtype) + s * P, n)
+        inverses[0][0, k] = T
+        return symmetric(product(T, P)), times(T, p + s * times(P, multipliers[0, k]))
 
     def stage(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         P, p = carry
         k = horizon - 1 - i
         a, b = A[0, k], B[0, k]
-        T, relaxed = lax.cond(s == 0.0, lambda P: (identity, P), softened, P)
-        slope = times(relaxed, h[0, k]) + times(T, p + s * times(P, multipliers[0, k]))
-        PA, PB = product(relaxed, a), product(relaxed, b)
+        P_relaxed, p_relaxed = relaxed(k, P, p)
+        slope = times(P_relaxed, h[0, k]) + p_relaxed
+        PA, PB = product(P_relaxed, a), product(P_relaxed, b)
         Qux, Quu = Hux[0, k] + product(b.T, PA), Huu[0, k] + product(b.T, PB)
         qu = gu[0, k] + transposed_times(b, slope)
         inverse = -swept(Quu, m)
         K, kff = -product(inverse, Qux), -times(inverse, qu)
         K = K - product(inverse, Qux + product(Quu, K))  # one refinement
-        gains[0, k], offsets[0, k], of_u[0, k] = K, kff, Quu
-        inverses[0, k], values[0, k], slopes[0, k] = T, P, p
+        gains[0, k], offsets[0, k], of_u[0, k], values[0, k], slopes[0, k] = K, kff, Quu, P, p
         before = Hxx[0, k] + product(a.T, PA) + product(Qux.T, K)
         return symmetric(before), gx[0, k] + transposed_times(a, slope) + transposed_times(Qux, kff)
 
     lax.fori_loop(0, horizon, stage, (Hxx[0, horizon], gx[0, horizon]))
 
 
-def forward(horizon: int, *refs: Any) -> None:
+def forward(horizon: int, soft: bool, noisy: bool, *refs: Any) -> None:
     """`method.riccati.solve_and_sample` of one chain; noise comes colored."""
-    soft, A, B, h, multipliers, gains, offsets, inverses, values, slopes, *rest = refs
-    s = soft[0, 0]
-    noisy = len(rest) > 3
-    white, (dx, du, rate, *noise) = (rest[:2], rest[2:]) if noisy else ([], rest)
+    A, B, h, multipliers, gains, offsets, values, slopes, *more = refs
+    rest = iter(more)
+    inverses, s = (next(rest), next(rest)[0, 0]) if soft else (None, None)
+    white = [next(rest), next(rest)] if noisy else []
+    dx, du, rate, *noise = rest
 
     def stage(k: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        a, b, K, T, p, multiplier = (
-            ref[0, k] for ref in (A, B, gains, inverses, slopes, multipliers)
-        )
+        a, b, K, p, multiplier = (ref[0, k] for ref in (A, B, gains, slopes, multipliers))
+        T = None if inverses is None else inverses[0, k]
         x = carry[0]
         u = times(K, x) + offsets[0, k]
-        x = times(T, h[0, k] + times(a, x) + times(b, u) + s * (multiplier - p))
+        x = h[0, k] + times(a, x) + times(b, u)
+        if T is not None:
+            x = times(T, x + s * (multiplier - p))
         dx[0, k], du[0, k] = x, u
         rate[0, k] = times(values[0, k], x) + p - multiplier
         if not noisy:
             return (x,)
         u = times(K, carry[1]) + white[0][0, k]
-        nx = times(T, times(a, carry[1]) + times(b, u)) - white[1][0, k]
+        nx = times(a, carry[1]) + times(b, u)
+        nx = (nx if T is None else times(T, nx)) - white[1][0, k]
         noise[0][0, k], noise[1][0, k] = nx, u
         return x, nx
 

@@ -66,12 +66,12 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
 
         def all_chains(has_rows: tuple[bool, ...], *arguments: Any) -> Any:
             arguments = repeated(has_rows, arguments)
-            steps = kernel_for(*jax.tree.leaves(arguments)) if on_gpu() else None
+            steps = kernel_for(*arrays_of(arguments)) if on_gpu() else None
             if steps is None:
                 return plain(*arguments)
 
             def kernel(*arguments: Any) -> Any:
-                return result(**steps(*jax.tree.leaves(arguments)))
+                return result(**steps(*arrays_of(arguments)))
 
             return lax.platform_dependent(*arguments, cuda=kernel, default=plain)
 
@@ -80,10 +80,16 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
     return decorate
 
 
-def kernel_for(A: Array, B: Array, *rest: Array) -> Callable[..., Any] | None:
+def arrays_of(arguments: Any) -> list[Array | None]:
+    """The arrays of a step's arguments, None where there is no penalty."""
+    return jax.tree.leaves(arguments, is_leaf=lambda leaf: leaf is None)
+
+
+def kernel_for(A: Array, B: Array, *rest: Array | None) -> Callable[..., Any] | None:
     """The kernel that is made for such blocks, if there is one."""
     ndx, nu = B.shape[-2:]
-    if min(ndx, nu) == 0 or not of_one_precision((A, B, *rest)):
+    there = [array for array in (A, B, *rest) if array is not None]
+    if min(ndx, nu) == 0 or not of_one_precision(there):
         return None
     if ndx <= MAX_NDX and nu <= MAX_NU:
         return newton_steps
@@ -101,7 +107,7 @@ def newton_steps(
     Hux: Array,
     Huu: Array,
     multipliers: Array,
-    penalty: Array,
+    penalty: Array | None = None,
     xi_u: Array | None = None,
     xi_e: Array | None = None,
     interpret: bool = False,
@@ -112,7 +118,7 @@ def newton_steps(
         A: (chains, K, ndx, ndx); B (chains, K, ndx, nu) and h (chains, K, ndx) likewise.
         gx: (chains, K+1, ndx); gu (chains, K, nu).
         Hxx: (chains, K+1, ndx, ndx); Hux (chains, K, nu, ndx) and Huu (chains, K, nu, nu).
-        multipliers: (chains, K, ndx); penalty (chains,).
+        multipliers: (chains, K, ndx); penalty (chains,), or None.
         xi_u: standard normal numbers (chains, K, nu), and xi_e (chains, K, ndx); None: no noise.
         interpret: run it without a GPU.
 
@@ -121,11 +127,12 @@ def newton_steps(
         (chains, K, nu, ndx); noise_x and noise_u are None without noise.
     """
     chains, horizon, n, m = B.shape
-    noisy = xi_u is not None
-    end = Layout(Hxx=tri(n), gx=(n,), penalty=(1,))
+    noisy, soft = xi_u is not None, {} if penalty is None else {"soft": (1,)}
+    end = Layout(Hxx=tri(n), gx=(n,), **soft)
     common = Layout(A=(n, n), B=(n, m), h=(n,), multiplier=(n,))
     costs = Layout(gx=(n,), gu=(m,), Hxx=tri(n), Hux=(m, n), Huu=tri(m))
-    left = Layout(K=(m, n), kff=(m,), Lu=tri(m), Ls=tri(n), P=tri(n), p=(n,))
+    relaxed = {"Ls": tri(n)} if soft else {}
+    left = Layout(K=(m, n), kff=(m,), Lu=tri(m), **relaxed, P=tri(n), p=(n,))
     white = Layout(xi_u=(m,), xi_e=(n,))
     noise = {"noise_x": (n,), "noise_u": (m,)} if noisy else {}
     out = Layout(dx=(n,), du=(m,), **noise, rate=(n,))
@@ -137,7 +144,8 @@ def newton_steps(
         shape = (horizon, result.size)
         return thread_for_each_row(program, THREADS, shape, [last, *stages], interpret=interpret)
 
-    last = end.pack(Hxx=lower_triangle(Hxx[:, -1]), gx=gx[:, -1], penalty=penalty[:, None])
+    ends = {"Hxx": lower_triangle(Hxx[:, -1]), "gx": gx[:, -1]}
+    last = end.pack(**ends, **({} if penalty is None else {"soft": 1.0 / penalty[:, None]}))
     model = common.pack(A=A, B=B, h=h, multiplier=multipliers)
     cost = costs.pack(
         gx=gx[:, :-1],
@@ -163,15 +171,18 @@ def backward(
     """`method.riccati.factorize` for the chains of a block of threads."""
     *stage_refs, out_ref = refs
     last = end.read(end_ref)
-    soft = 1.0 / last["penalty"][0]
+
+    def relaxed(P: Matrix, p: Vector, multiplier: Vector) -> tuple[Matrix, Vector, Matrix]:
+        if "soft" not in last:
+            return P, p, []
+        (soft,), n = last["soft"], range(len(p))
+        Ls = factor([[soft * P[r][c] + (1.0 if r == c else 0.0) for c in n] for r in n])
+        right = [a + soft * b for a, b in zip(p, matvec(P, multiplier), strict=True)]
+        return symmetric([solve(Ls, row) for row in P]), solve(Ls, right), Ls
 
     def stage(k: Array, s: dict[str, Any], carry: Any) -> Any:
         P, p = carry
-        n = range(len(p))
-        Ls = factor([[soft * P[r][c] + (1.0 if r == c else 0.0) for c in n] for r in n])
-        right = [a + soft * b for a, b in zip(p, matvec(P, s["multiplier"]), strict=True)]
-        p_relaxed = solve(Ls, right)
-        P_relaxed = symmetric([solve(Ls, row) for row in P])
+        P_relaxed, p_relaxed, Ls = relaxed(P, p, s["multiplier"])
         slope = add(matvec(P_relaxed, s["h"]), p_relaxed)
         A, B = s["A"], s["B"]
         PA, PB = matmul(P_relaxed, A), matmul(P_relaxed, B)
@@ -192,34 +203,33 @@ def forward(horizon: int, end: Layout, layouts: Sequence[Layout], end_ref: Any, 
     """`method.riccati.solve_and_sample` for the chains of a block of threads."""
     *stage_refs, out_ref = refs
     last = end.read(end_ref)
-    soft = 1.0 / last["penalty"][0]
-    size = jnp.sqrt(soft)
+    soft = last["soft"][0] if "soft" in last else None
 
     def stage(k: Array, s: dict[str, Any], carry: Any) -> Any:
         dx, nx = carry
-        Lu, Ls = triangular(s["Lu"]), triangular(s["Ls"])
+        Lu, Ls = triangular(s["Lu"]), [] if soft is None else triangular(s["Ls"])
 
         def after(x: Vector, u: Vector) -> Vector:
             return add(matvec(s["A"], x), matvec(s["B"], u))
 
-        du = add(matvec(s["K"], dx), s["kff"])
-        y = add(s["h"], after(dx, du))
-        right = [a + soft * (c - b) for a, b, c in zip(y, s["p"], s["multiplier"], strict=True)]
-        noise = []
+        du, nu = add(matvec(s["K"], dx), s["kff"]), []
+        dx = add(s["h"], after(dx, du))
         if nx:
             nu = add(matvec(s["K"], nx), solve_upper(Lu, s["xi_u"], mul))
-            spread = solve(Ls, after(nx, nu))
-            kicks = solve_upper(Ls, s["xi_e"], mul)
-            nx = [a - size * b for a, b in zip(spread, kicks, strict=True)]
-            noise = [nx, nu]
-        dx = solve(Ls, right)
+            nx = after(nx, nu)
+        if soft is not None:
+            push = [b - a for a, b in zip(s["p"], s["multiplier"], strict=True)]
+            dx = solve(Ls, [a + soft * b for a, b in zip(dx, push, strict=True)])
+            if nx:
+                kicks, size = solve_upper(Ls, s["xi_e"], mul), jnp.sqrt(soft)
+                nx = [a - size * b for a, b in zip(solve(Ls, nx), kicks, strict=True)]
         costate = add(matvec(full(s["P"]), dx), s["p"])
         rate = [a - b for a, b in zip(costate, s["multiplier"], strict=True)]
-        write(out_ref, k, dx, du, *noise, rate)
+        write(out_ref, k, dx, du, nx, nu, rate)
         return dx, nx
 
     noisy = any("xi_u" in layout.shapes for layout in layouts)
-    zero = [jnp.zeros_like(soft)] * len(last["gx"])
+    zero = [jnp.zeros_like(last["gx"][0])] * len(last["gx"])
     over_stages(horizon, layouts, stage_refs, stage, (zero, zero if noisy else []))
 
 

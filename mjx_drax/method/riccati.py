@@ -10,12 +10,13 @@ function 1/2 x'Px + p'x of the stages after k, minimizing over dx_{k+1} at a fix
 y = h + A dx + B du gives e = S^{-1} (P y + p - lambda), S = mu I + P, and
 
     P~ = mu S^{-1} P                          (P as mu -> infinity: ordinary LQR)
-    p~ = S^{-1} (mu p + P lambda)             computed with S / mu = I + P / mu, also for mu = inf
+    p~ = S^{-1} (mu p + P lambda)             computed with S / mu = I + P / mu
     Qxx = Hxx + A'P~A      Quu = Huu + B'P~B      Qux = Hux + B'P~A
     qx = gx + A'(P~h + p~)                    qu = gu + B'(P~h + p~)
     K = -Quu^{-1} Qux      kff = -Quu^{-1} qu     P <- Qxx + Qux'K      p <- qx + Qux'kff
 
-which is the Riccati recursion with dual regularization. Nothing with a condition number near mu is
+which is the Riccati recursion with dual regularization. Without a penalty, as for mu -> infinity,
+P~ = P and p~ = p: the linearized dynamics hold, and there is no S to factorize. Nothing with a condition number near mu is
 ever formed, so float32 suffices. The conditional distributions of N(0, M^{-1}) are
 du | dx ~ N(K dx, Quu^{-1}) and e | y ~ N(S^{-1}P y, S^{-1}), for which the Cholesky factors of Quu
 and S are at hand. Newton step and noise are hence two solutions of one affine recursion
@@ -48,13 +49,14 @@ class Factorization:
     """What the backward recursion leaves at every stage.
 
     gains K (K, nu, ndx) and kff (K, nu); Lu (K, nu, nu) and Ls (K, ndx, ndx), the lower Cholesky
-    factors of Quu and S / mu; P (K, ndx, ndx) and p (K, ndx), the value function after the stage.
+    factors of Quu and S / mu, the latter None without a penalty; P (K, ndx, ndx) and p (K, ndx),
+    the value function after the stage.
     """
 
     gains: Array
     kff: Array
     Lu: Array
-    Ls: Array
+    Ls: Array | None
     P: Array
     p: Array
 
@@ -105,22 +107,28 @@ class Step:
 
 
 def factorize(
-    model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array
+    model: Linearization, cost: QuadraticCost, multipliers: Array, penalty: Array | None
 ) -> tuple[tuple[Array, Array], Factorization]:
-    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, at most infinite.
+    """The backward recursion, for multipliers (K, ndx) and penalty mu > 0, or None.
 
     Returns P and p of x_0, and the factors of every stage.
     """
-    soft, identity = 1.0 / penalty, jnp.eye(model.A.shape[-1], dtype=model.A.dtype)
+
+    def relaxed(P: Array, p: Array, multiplier: Array) -> tuple[Array, Array, Array | None]:
+        """P~, p~ and Ls."""
+        if penalty is None:
+            return P, p, None
+        soft = 1.0 / penalty
+        Ls = cholesky(jnp.eye(len(p), dtype=p.dtype) + soft * P)
+        found = solve(Ls, jnp.column_stack([P, p + soft * product(P, multiplier)]))
+        return symmetric(found[:, :-1]), found[:, -1], Ls
 
     def stage(
         carry: tuple[Array, Array], inputs: tuple[Array, ...]
     ) -> tuple[tuple[Array, Array], Factorization]:
         P, p = carry
         A, B, h, gx, gu, Hxx, Hux, Huu, multiplier = inputs
-        Ls = cholesky(identity + soft * P)
-        relaxed = solve(Ls, jnp.column_stack([P, p + soft * product(P, multiplier)]))
-        P_relaxed, p_relaxed = symmetric(relaxed[:, :-1]), relaxed[:, -1]
+        P_relaxed, p_relaxed, Ls = relaxed(P, p, multiplier)
         slope = product(P_relaxed, h) + p_relaxed
         PA, PB = product(P_relaxed, A), product(P_relaxed, B)
         Qxx, Qux, Quu = Hxx + product(A.T, PA), Hux + product(B.T, PA), Huu + product(B.T, PB)
@@ -140,7 +148,7 @@ def solve_and_sample(
     model: Linearization,
     factors: Factorization,
     multipliers: Array,
-    penalty: Array,
+    penalty: Array | None,
     white: White | None = None,
     first: Array | None = None,
 ) -> Step:
@@ -155,18 +163,19 @@ def solve_and_sample(
         model: Linearization, factors: Factorization, multiplier: Array, white: White | None
     ) -> tuple[Array, Array]:
         """F, and the columns f of the step and of the noise."""
-        step = model.h + product(model.B, factors.kff)
-        closed = model.A + product(model.B, factors.gains)
-        right = [closed, step + soft * (multiplier - factors.p)]
-        if white is None:
-            out = solve(factors.Ls, jnp.column_stack(right))
-            return out[:, :-1], out[:, -1:]
-        noise = product(model.B, solve_upper(factors.Lu, white.u))
-        out = solve(factors.Ls, jnp.column_stack([*right, noise]))
-        f_noise = out[:, -1] - jnp.sqrt(soft) * solve_upper(factors.Ls, white.e)
-        return out[:, :-2], jnp.column_stack([out[:, -2], f_noise])
+        columns = [model.A + product(model.B, factors.gains), model.h + product(model.B, factors.kff)]
+        if white is not None:
+            columns.append(product(model.B, solve_upper(factors.Lu, white.u)))
+        if penalty is not None:
+            assert factors.Ls is not None
+            soft = 1.0 / penalty
+            columns[1] = columns[1] + soft * (multiplier - factors.p)
+            out = solve(factors.Ls, jnp.column_stack(columns))
+            columns = [out[:, : len(out)], *out[:, len(out) :].T]
+            if white is not None:
+                columns[2] = columns[2] - jnp.sqrt(soft) * solve_upper(factors.Ls, white.e)
+        return columns[0], jnp.column_stack(columns[1:])
 
-    soft = 1.0 / penalty
     F, f = jax.vmap(affine)(model, factors, multipliers, white)
     if first is not None:
         f = f.at[0].add(F[0] @ first)
@@ -188,7 +197,7 @@ def newton(
     model: Linearization,
     cost: QuadraticCost,
     multipliers: Array,
-    penalty: Array,
+    penalty: Array | None,
     white: White | None = None,
 ) -> Step:
     """Newton step of one chain for multipliers (K, ndx) and penalty mu; noise of `white`."""
@@ -200,7 +209,7 @@ def newton_with_start(
     model: Linearization,
     cost: QuadraticCost,
     multipliers: Array,
-    penalty: Array,
+    penalty: Array | None,
     white: White | None,
     start: Start | None,
 ) -> Step:

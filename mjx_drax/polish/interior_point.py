@@ -533,7 +533,6 @@ def _direction(
     slope, curvature = model.barrier
     penalties = _penalties(derivatives.stage, derivatives.terminal, diagonal, stiffness)
     whole, stages, end = with_constraints(cost, derivatives, model, penalties, jnp.zeros(()))
-    stiff = jnp.full((), jnp.inf, of_u.dtype)  # the rows of the dynamics are regular
     gx, gu = whole.gx.at[1:].add(slope.x), whole.gu + slope.u
     Hxx = whole.Hxx.at[1:].add(jax.vmap(jnp.diag)(curvature.x))
     Huu = whole.Huu + jax.vmap(jnp.diag)(curvature.u)
@@ -548,8 +547,9 @@ def _direction(
         )
         if learned is not None:
             damped = with_curvature(damped, share * learned)
-        present = derivatives.dynamics, damped, multipliers.dynamics, stiff
-        step = newton_with_start(*present, None, start_of(model))
+        present = derivatives.dynamics, damped, multipliers.dynamics
+        # No penalty for dynamics, whose rows are regular
+        step = newton_with_start(*present, None, None, start_of(model))
         first = None if step.first is None else step.first[:, 0]
         ds, rate = jax.vmap(lambda block, dz: slack_step(block, dz, penalties.stage))(
             stages, stage_steps(step.dx, step.du, first)

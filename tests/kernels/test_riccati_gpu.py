@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_drax.kernels import riccati_blocks, riccati_gpu
-from mjx_drax.kernels.riccati_gpu import MAX_NDX, THREADS, newton_steps
+from mjx_drax.kernels.riccati_gpu import MAX_NDX, THREADS, arrays_of, newton_steps
 from mjx_drax.method.model import Linearization, QuadraticCost
 from mjx_drax.method.riccati import White, newton
 
@@ -16,8 +16,8 @@ K, NDX, NU = 3, 3, 2
 JAX = tuple(map(int, jax.__version__.split(".")[:2]))
 
 
-def batch(chains, dtype, noisy=True, ndx=NDX):
-    """A different problem for every chain, penalties included."""
+def batch(chains, dtype, noisy=True, ndx=NDX, soft=True):
+    """A different problem for every chain, penalties included, if there are `soft` dynamics."""
     rng = np.random.default_rng(0)
     n = ndx + NU
     A, B, h = (rng.normal(size=(chains, K, ndx, *m)) for m in [(ndx,), (NU,), ()])
@@ -32,6 +32,7 @@ def batch(chains, dtype, noisy=True, ndx=NDX):
     )
     white = White(rng.normal(size=(chains, K, NU)), rng.normal(size=(chains, K, ndx)))
     multipliers, penalties = rng.normal(size=(chains, K, ndx)), np.geomspace(10.0, 1e4, chains)
+    penalties = penalties if soft else None
     arguments = (Linearization(A, B, h), cost, multipliers, penalties, white if noisy else None)
     return jax.tree.map(lambda a: jnp.asarray(a, dtype), arguments)
 
@@ -45,22 +46,24 @@ def agree(seen, wanted, tolerance):
             np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * scale, err_msg=name)
 
 
-@pytest.mark.parametrize("noisy", [True, False])
-def test_it_agrees_with_the_plain_recursion(noisy):
-    with jax.enable_x64(True):
-        arguments = batch(THREADS + 5, np.float64, noisy)  # two warps, one of them not full
-        plain = jax.jit(jax.vmap(newton))(*arguments)
-        agree(newton_steps(*jax.tree.leaves(arguments), interpret=True), plain, 1e-9)
+KINDS = [(True, True), (False, True), (False, False), (True, False)]
+"""Noise, and a penalty: the flow has one, the polish neither."""
 
 
-@pytest.mark.parametrize(("noisy", "penalty"), [(True, None), (False, None), (False, np.inf)])
-def test_blocks_agree_with_the_plain_recursion(noisy, penalty):
+@pytest.mark.parametrize(("noisy", "soft"), KINDS)
+def test_it_agrees_with_the_plain_recursion(noisy, soft):
     with jax.enable_x64(True):
-        arguments = batch(2, np.float64, noisy, ndx=17)  # a tile of 32
-        if penalty:  # as the polish asks for
-            arguments = (*arguments[:3], jnp.full(2, penalty), arguments[-1])
+        arguments = batch(THREADS + 5, np.float64, noisy, soft=soft)  # two warps, one not full
         plain = jax.jit(jax.vmap(newton))(*arguments)
-        seen = riccati_blocks.newton_steps(*jax.tree.leaves(arguments), interpret=True)
+        agree(newton_steps(*arrays_of(arguments), interpret=True), plain, 1e-9)
+
+
+@pytest.mark.parametrize(("noisy", "soft"), KINDS)
+def test_blocks_agree_with_the_plain_recursion(noisy, soft):
+    with jax.enable_x64(True):
+        arguments = batch(2, np.float64, noisy, ndx=17, soft=soft)  # a tile of 32
+        plain = jax.jit(jax.vmap(newton))(*arguments)
+        seen = riccati_blocks.newton_steps(*arrays_of(arguments), interpret=True)
         agree(seen, plain, 1e-9)
 
 
@@ -68,7 +71,7 @@ def test_blocks_that_are_not_positive_definite_are_not_numbers():
     """The polish sees from it that the model needs more damping."""
     linear, cost, *rest = batch(2, np.float32, noisy=False)
     cost = replace(cost, Huu=cost.Huu.at[1].add(-1e4 * jnp.eye(NU)))
-    arrays = jax.tree.leaves((linear, cost, *rest))
+    arrays = arrays_of((linear, cost, *rest))
     seen = riccati_blocks.newton_steps(*arrays, interpret=True)
     assert [bool(jnp.isfinite(dx).all()) for dx in seen["dx"]] == [True, False]
 
@@ -115,6 +118,6 @@ def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeyp
 @pytest.mark.parametrize("steps", [newton_steps, riccati_blocks.newton_steps])
 @pytest.mark.parametrize("noisy", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_it_lowers_for_cuda_without_a_gpu(noisy, steps):
-    arrays = jax.tree.leaves(batch(4, np.float32, noisy))
+    arrays = arrays_of(batch(4, np.float32, noisy))
     text = jax.jit(steps).trace(*arrays).lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("triton") >= 2

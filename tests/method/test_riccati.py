@@ -69,6 +69,19 @@ def test_step_is_newtons_and_multipliers_follow_the_predicted_defect(mu, seed):
     np.testing.assert_allclose(np.ravel(step.rate), mu * (h + J @ d), rtol=1e-7, atol=1e-5)
 
 
+def test_without_a_penalty_the_linearized_dynamics_hold_and_noise_stays_on_them():
+    model, cost, multipliers = drawn(5)
+    H, g, J = dense(model, cost)
+    zero, h = np.zeros((len(J), len(J))), model.h.ravel()
+    d, of_rows = np.split(np.linalg.solve(np.block([[H, J.T], [J, zero]]), -np.r_[g, h]), [len(g)])
+    step = jax.jit(newton)(model, cost, multipliers, None, white(KEY))
+    np.testing.assert_allclose(flat(step.dx, step.du), d, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(np.ravel(step.rate), of_rows - multipliers.ravel(), atol=1e-6)
+    noise = flat(step.noise_x, step.noise_u)
+    np.testing.assert_allclose(J @ noise, 0, atol=1e-9)
+    assert np.abs(noise).max() > 0.1
+
+
 def test_float32_needs_no_digits_for_the_penalty():
     model, cost, multipliers = drawn(2)
     H, g, J = dense(model, cost)
