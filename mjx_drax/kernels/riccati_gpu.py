@@ -80,7 +80,7 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
     return decorate
 
 
-def arrays_of(arguments: Any) -> list[Array | None]:
+def arrays_of(arguments: Any) -> list[Any]:
     """The arrays of a step's arguments, None where there is no penalty."""
     return jax.tree.leaves(arguments, is_leaf=lambda leaf: leaf is None)
 

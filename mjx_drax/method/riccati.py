@@ -16,8 +16,8 @@ y = h + A dx + B du gives e = S^{-1} (P y + p - lambda), S = mu I + P, and
     K = -Quu^{-1} Qux      kff = -Quu^{-1} qu     P <- Qxx + Qux'K      p <- qx + Qux'kff
 
 which is the Riccati recursion with dual regularization. Without a penalty, as for mu -> infinity,
-P~ = P and p~ = p: the linearized dynamics hold, and there is no S to factorize. Nothing with a condition number near mu is
-ever formed, so float32 suffices. The conditional distributions of N(0, M^{-1}) are
+P~ = P and p~ = p: the linearized dynamics hold, and there is no S to factorize. Nothing with a
+condition number near mu is ever formed, so float32 suffices. The conditional distributions of N(0, M^{-1}) are
 du | dx ~ N(K dx, Quu^{-1}) and e | y ~ N(S^{-1}P y, S^{-1}), for which the Cholesky factors of Quu
 and S are at hand. Newton step and noise are hence two solutions of one affine recursion
 
@@ -163,7 +163,10 @@ def solve_and_sample(
         model: Linearization, factors: Factorization, multiplier: Array, white: White | None
     ) -> tuple[Array, Array]:
         """F, and the columns f of the step and of the noise."""
-        columns = [model.A + product(model.B, factors.gains), model.h + product(model.B, factors.kff)]
+        columns = [
+            model.A + product(model.B, factors.gains),
+            model.h + product(model.B, factors.kff),
+        ]
         if white is not None:
             columns.append(product(model.B, solve_upper(factors.Lu, white.u)))
         if penalty is not None:

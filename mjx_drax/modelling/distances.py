@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mjx_drax.kernels.linalg import product
 from mjx_drax.physics.engine import mujoco
 
 
@@ -43,7 +44,9 @@ class Shape(NamedTuple):
 
     def seen_from(self, other: Shape) -> tuple[Array, Array]:
         """Centre (3,) and frame (3, 3) in the frame of another shape."""
-        return other.frame.T @ (self.centre - other.centre), other.frame.T @ self.frame
+        # As sums: XLA fails to compile Hessians of products `@` of several pairs (jaxlib 0.10.2)
+        back = other.frame.T
+        return product(back, self.centre - other.centre), product(back, self.frame)
 
 
 def norm(vectors: Array) -> Array:

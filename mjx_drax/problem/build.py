@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import DraxError, require_positive, require_whole, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, require_positive, require_whole, shown
 from mjx_drax.base.numbers import vector
 from mjx_drax.problem.choices import Choices, extend, phases_of
 from mjx_drax.problem.cost import as_partial, constraint_of, cost_of, takes_knot
@@ -26,7 +27,11 @@ MOST = 1_000_000
 
 
 def knots_in(horizon: Any, dt: float) -> int:
-    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s]."""
+    """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
+
+    Warns:
+        DraxWarning: the horizon is no multiple of dt.
+    """
     for label, value in (("dt", dt), ("horizon", horizon)):
         require_positive(label, value, "a positive number of seconds")
     share = float(horizon) / float(dt)
@@ -39,7 +44,15 @@ def knots_in(horizon: Any, dt: float) -> int:
             f"horizon is {horizon} s, which is {share:.3g} control steps of {dt:g} s: give less "
             f"than {MOST:,} steps."
         )
-    return round(share)
+    K = round(share)
+    if abs(share - K) > 1e-6 * K:
+        warnings.warn(
+            f"horizon is {horizon:g} s, no multiple of dt = {dt:g} s: the plan has {K} knots and "
+            f"lasts {K * dt:g} s. Give that horizon, or another dt.",
+            DraxWarning,
+            stacklevel=3,
+        )
+    return K
 
 
 def steps(horizon: Any, dt: float | None, count: Any) -> tuple[int, float]:

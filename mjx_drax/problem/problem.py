@@ -557,11 +557,12 @@ def _check_bounds(problem: Problem, start: np.ndarray) -> None:
                 )
     if bounds.x_lower.ndim == bounds.x_upper.ndim == 1:
         low, high = np.asarray(bounds.x_lower), np.asarray(bounds.x_upper)
-        outside = np.maximum(low - start, start - high).max(initial=0.0)
-        if outside > 1e-6:
+        outside = np.maximum(low - start, start - high)
+        if (outside > 1e-6).any():
+            most = int(outside.argmax())
             raise DraxError(
-                f"x_init = {shown(start.tolist())} lies outside the bounds of x by {outside:.3g}: "
-                "move it inside, or widen the bounds."
+                f"x_init = {shown(start.tolist())} lies outside the bounds of x by "
+                f"{outside[most]:.3g} at element {most}: move it inside, or widen the bounds."
             )
 
 

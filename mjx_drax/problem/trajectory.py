@@ -175,8 +175,8 @@ def box(
             return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
         except (TypeError, ValueError) as error:
             raise DraxError(
-                f"{label} is {shown(value)}: give numbers of shape ({size},), or one for all; -inf "
-                "and inf leave it free."
+                f"{label} is {shown(value)}: give numbers of shape ({size},), or one for all, and "
+                "no NaN; -inf and inf leave it free."
             ) from error
 
     (xl, xu), (ul, uu) = _pair("x", x), _pair("u", u)

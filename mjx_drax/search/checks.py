@@ -5,6 +5,7 @@ Settings are looked at; functions are traced, and tried at the initial knots, wi
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.base.errors import DraxError, require_part, require_whole, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, require_part, require_whole, shown
 from mjx_drax.base.numbers import numbers
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.method.bounds import Bounds
@@ -26,6 +27,7 @@ from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import STEP, Problem, functions_of
 from mjx_drax.problem.tracing import require_derivatives
 from mjx_drax.problem.trajectory import Knot, Trajectory
+from mjx_drax.search.iterate import FEASIBLE
 
 _POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
 
@@ -160,18 +162,33 @@ def require_finite(
             )
 
 
-def require_sound(flow: Langevin, problem: Problem, knots: Trajectory, with_f: bool = True) -> None:
+def require_sound(
+    flow: Langevin,
+    problem: Problem,
+    knots: Trajectory,
+    with_f: bool = True,
+    alone: bool = False,
+) -> None:
     """Complain about a function that is finite, with its derivatives, for no chain's knots.
 
     Those of a stage are tried at x_init, where every chain stays, and its first control; those of
     the end at its last state.
 
+    Args:
+        flow, problem: as solved.
+        knots: initial ones of every chain, (chains, K, ...).
+        with_f: whether f is tried.
+        alone: whether it is the only problem that is solved.
+
     Raises:
         DraxError: naming the function, where it fails and the fix.
+
+    Warns:
+        DraxWarning: alone, it has an x_init that breaks a constraint, whatever the controls are.
     """
     flow = replace(flow, scale=Scale())  # of one type, measured or not
     stages, end = _starts(flow, problem, knots)
-    finite = _finite(problem, stages, end, _in_forward(flow, problem), with_f)
+    finite, constraints = _finite(problem, stages, end, _in_forward(flow, problem), with_f)
     for label, what, good in _by_function(problem, finite):
         if not good.any():
             at = "the initial points"
@@ -181,6 +198,30 @@ def require_sound(flow: Langevin, problem: Problem, knots: Trajectory, with_f: b
                 f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
                 "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
                 "move x_init or the scatter of initial knots."
+            )
+    if alone and problem.start_map is None:
+        u = np.asarray(stages)[:, 0, problem.dynamics.nx :]
+        _warn_of_start(u, {name: np.asarray(a)[:, 0] for name, a in constraints.items()})
+
+
+def _warn_of_start(u: np.ndarray, constraints: dict[str, np.ndarray]) -> None:
+    """Warn of constraints (chains, m) at x_init that are broken alike by all controls (chains, nu).
+
+    Where chains share a control, it may be what breaks them.
+    """
+    if not np.ptp(u, axis=0).all():
+        return
+    for name, values in constraints.items():
+        by = np.abs(values[0]) if name == "equality" else values[0]
+        broken = (by > FEASIBLE) & (values == values[0]).all(axis=0)
+        if broken.any():
+            row = int(broken.argmax())
+            warnings.warn(
+                f"x_init breaks {name} [{row}] by {by[row]:.3g}, whatever the controls are, so no "
+                "plan can be certified: move x_init, or let the constraint hold later only "
+                "(`between`).",
+                DraxWarning,
+                stacklevel=2,
             )
 
 
@@ -207,7 +248,7 @@ def require_alive(flow: Langevin, problem: Problem, knots: Trajectory, died_at: 
     """
     stages = jnp.concatenate([problem.with_start(knots)[:, :-1], knots.u], axis=-1)
     end = jnp.concatenate([knots.x[:, -1:], knots.u[:, -1:]], axis=-1)
-    finite = _finite(problem, stages, end, _in_forward(flow, problem))
+    finite, _ = _finite(problem, stages, end, _in_forward(flow, problem))
     for label, what, good in _by_function(problem, finite):
         if not good.all(axis=1).any():
             k = int(np.argmin(good[0]))
@@ -233,10 +274,11 @@ def _by_function(
 @partial(jax.jit, static_argnames=("exact", "with_f"))
 def _finite(
     problem: Problem, stages: Array, end: Array, exact: bool, with_f: bool = True
-) -> dict[str, list[Array]]:
+) -> tuple[dict[str, list[Array]], dict[str, Array]]:
     """Whether functions, first and second derivatives are finite at z = [x, u], (chains, n) each.
 
-    Derivatives are taken in one direction that moves every number.
+    Derivatives are taken in one direction that moves every number. Also the values of constraints
+    of a stage, (chains, n, m).
 
     Args:
         problem: whose functions.
@@ -244,7 +286,7 @@ def _finite(
         exact: whether derivatives are tried.
         with_f: whether f is tried.
     """
-    found = {}
+    found, constraints = {}, {}
     knots = problem.knots
     for label, _, arguments, _ in functions_of(problem):
         if label == STEP and not with_f:
@@ -258,7 +300,9 @@ def _finite(
         found[label] = [
             jnp.isfinite(each).reshape(*each.shape[:2], -1).all(axis=-1) for each in orders
         ]
-    return found
+        if label in ("equality", "inequality"):
+            constraints[label] = orders[0].reshape(*orders[0].shape[:2], -1)
+    return found, constraints
 
 
 def _slopes_at(problem: Problem, label: str, order: int, z: Array, knot: Knot) -> tuple[Array, ...]:

@@ -227,7 +227,8 @@ class Search:
         if not saved:
             mine = knots if family.alone else jax.tree.map(lambda a: a[: self.chains], knots)
             flow = self.settings.first(1.0)
-            require_sound(flow, one, mine, with_f=not family.problem.dynamics.checked)
+            with_f = not family.problem.dynamics.checked
+            require_sound(flow, one, mine, with_f, family.alone)
         self._settle(0, False, indices, scale)
         state = self._begun(0, knots, keys)
         zeros: Any = np.zeros(rows, knots.u.dtype)

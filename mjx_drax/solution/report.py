@@ -214,8 +214,8 @@ def _advice(solution: Results) -> str:
     if broken <= {GOAL} and len(costs) > 2 and alike > len(costs) / 2:
         return (
             f"feasible chains miss the goal, {alike} of {len(costs)} at the same cost, so more "
-            "chains will hardly help. Give a guess of another motion, or more weight on the "
-            "terminal cost."
+            "chains will hardly help. Give a longer horizon, a guess of another motion, or more "
+            "weight on the terminal cost."
         )
     return (
         "feasible chains miss the goal or break constraints when replayed. Try a guess of the "

@@ -1,5 +1,8 @@
 """Problems from functions: what is refused, and where initial knots are scattered."""
 
+import re
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +15,14 @@ from mjx_drax import (
     DraxError,
     Langevin,
     Trajectory,
+    between,
     from_function,
     from_program,
     minimize,
     solve,
     tasks,
 )
+from mjx_drax.base.errors import DraxWarning
 
 
 def make(**changes):
@@ -45,6 +50,33 @@ def test_a_problem_shows_itself_in_a_line():
 def test_misfits_are_named(changes, message):
     with pytest.raises(DraxError, match=message):
         make(**changes)
+
+
+def test_a_horizon_that_is_no_multiple_of_the_step_is_told_how_long_the_plan_is():
+    with pytest.warns(DraxWarning, match=r"no multiple of dt = 0\.1 s.* 10 knots and lasts 1 s"):
+        assert make(horizon=1.04).horizon == 10
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert make(horizon=0.7).horizon == 7  # 0.7 / 0.1 is not 7 to the last digit
+
+
+@pytest.mark.parametrize(
+    ("x", "inequality", "told"),
+    [
+        ([0.5], lambda x, u: jnp.array([x[0] - 1.0, x[0] - 0.2]), r"inequality \[1\] by 0\.3"),
+        ([0.5], lambda x, u: x[0] - 1.0, None),
+        ([0.5], lambda x, u: x + u - 0.2, None),  # a control can keep it
+        ([2.0], between(lambda x, u: x - 1.0, 0.5, 1.0), None),
+    ],
+)
+def test_a_start_that_breaks_a_constraint_is_told_before_the_solve(x, inequality, told):
+    problem, few = make(x_init=x, inequality=inequality), Langevin(iterations=1, tail=0)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        solve(problem, chains=2, solver=few, progress=False)
+    seen = [str(w.message) for w in seen if issubclass(w.category, DraxWarning)]
+    assert len(seen) == (told is not None)
+    assert told is None or re.search(f"x_init breaks {told}, whatever the controls", seen[0])
 
 
 @pytest.mark.parametrize("arguments", [{"chains": 0}, {"chains": 2.5}, {"seed": -1}, {"seed": 1.5}])
