@@ -19,7 +19,8 @@ which is the Riccati recursion with dual regularization. Without a penalty, as f
 P~ = P and p~ = p: the linearized dynamics hold, and there is no S to factorize. Nothing with a
 condition number near mu is ever formed, so float32 suffices. The conditional distributions of
 N(0, M^{-1}) are du | dx ~ N(K dx, Quu^{-1}) and e | y ~ N(S^{-1}P y, S^{-1}), for which the
-Cholesky factors of Quu and S are at hand. Newton step and noise are hence two solutions of one affine recursion
+Cholesky factors of Quu and S are at hand. Newton step and noise are hence two solutions of one
+affine recursion
 
     dx_{k+1} = F_k dx_k + f_k,     F = mu S^{-1} (A + B K)
 
