@@ -81,7 +81,7 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
 
 
 def arrays_of(arguments: Any) -> list[Any]:
-    """The arrays of a step's arguments, None where there is no penalty."""
+    """The arrays of a step's arguments, with None for the penalty where there is none."""
     return jax.tree.leaves(arguments, is_leaf=lambda leaf: leaf is None)
 
 
@@ -127,12 +127,12 @@ def newton_steps(
         (chains, K, nu, ndx); noise_x and noise_u are None without noise.
     """
     chains, horizon, n, m = B.shape
-    noisy, soft = xi_u is not None, {} if penalty is None else {"soft": (1,)}
-    end = Layout(Hxx=tri(n), gx=(n,), **soft)
+    noisy, soft = xi_u is not None, penalty is not None
+    end = Layout(Hxx=tri(n), gx=(n,), **({"soft": (1,)} if soft else {}))
     common = Layout(A=(n, n), B=(n, m), h=(n,), multiplier=(n,))
     costs = Layout(gx=(n,), gu=(m,), Hxx=tri(n), Hux=(m, n), Huu=tri(m))
-    relaxed = {"Ls": tri(n)} if soft else {}
-    left = Layout(K=(m, n), kff=(m,), Lu=tri(m), **relaxed, P=tri(n), p=(n,))
+    Ls = {"Ls": tri(n)} if soft else {}
+    left = Layout(K=(m, n), kff=(m,), Lu=tri(m), **Ls, P=tri(n), p=(n,))
     white = Layout(xi_u=(m,), xi_e=(n,))
     noise = {"noise_x": (n,), "noise_u": (m,)} if noisy else {}
     out = Layout(dx=(n,), du=(m,), **noise, rate=(n,))
@@ -144,8 +144,8 @@ def newton_steps(
         shape = (horizon, result.size)
         return thread_for_each_row(program, THREADS, shape, [last, *stages], interpret=interpret)
 
-    ends = {"Hxx": lower_triangle(Hxx[:, -1]), "gx": gx[:, -1]}
-    last = end.pack(**ends, **({} if penalty is None else {"soft": 1.0 / penalty[:, None]}))
+    softness = {} if penalty is None else {"soft": 1.0 / penalty[:, None]}
+    last = end.pack(Hxx=lower_triangle(Hxx[:, -1]), gx=gx[:, -1], **softness)
     model = common.pack(A=A, B=B, h=h, multiplier=multipliers)
     cost = costs.pack(
         gx=gx[:, :-1],
@@ -173,6 +173,7 @@ def backward(
     last = end.read(end_ref)
 
     def relaxed(P: Matrix, p: Vector, multiplier: Vector) -> tuple[Matrix, Vector, Matrix]:
+        """P~, p~ and Ls."""
         if "soft" not in last:
             return P, p, []
         (soft,), n = last["soft"], range(len(p))

@@ -78,9 +78,9 @@ def from_mjcf(
 
     Args:
         model: MJCF file, XML string or `mujoco.MjModel`.
-        horizon: duration [s]; K = horizon / dt knots, rounded. Or (least, most) of a free one, or a
-            list of such pairs for phases: the model's timestep scales, in the plan and in the C
-            engine.
+        horizon: duration [s]; K = horizon / dt knots, rounded with a warning. Or (least, most) of a
+            free one, or a list of such pairs for phases: the model's timestep scales, in the plan
+            and in the C engine.
         knots: K of a free duration; for phases the number of each.
         running_cost: l(data, u), a scalar, summed over the knots without a factor dt.
         terminal_cost: phi(data), a scalar.
@@ -137,7 +137,8 @@ def from_mjcf(
     Warns:
         DraxWarning: MJX computes the model a little differently from the C engine; the model's
             contact solver stops early; numbers that it has for MJX are set aside; x_init lies
-            outside of a joint's range; more contacts act at x_init than the plan keeps.
+            outside of a joint's range; more contacts act at x_init than the plan keeps; the horizon
+            is no multiple of dt.
     """
     given = {
         "running_cost": running_cost,

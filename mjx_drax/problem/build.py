@@ -115,8 +115,8 @@ def from_function(
         x_init: x_0, (nx,).
         nu: size of a control.
         horizon: duration [s]; or (least, most) of a free one, or a list of such pairs for phases.
-        dt: control step [s]; K = horizon / dt knots, rounded. Where the duration is free, f takes
-            its step from `knot.dt`.
+        dt: control step [s]; K = horizon / dt knots, rounded with a warning. Where the duration
+            is free, f takes its step from `knot.dt`.
         knots: K, instead of dt; for phases the number of each.
         running_cost: l(x, u), a scalar, summed over the knots as it stands.
         terminal_cost: phi(x), a scalar.

@@ -218,8 +218,7 @@ def _warn_of_start(u: np.ndarray, constraints: dict[str, np.ndarray]) -> None:
             row = int(broken.argmax())
             warnings.warn(
                 f"x_init breaks {name} [{row}] by {by[row]:.3g}, whatever the controls are, so no "
-                "plan can be certified: move x_init, or let the constraint hold later only "
-                "(`between`).",
+                "plan is feasible: move x_init, or let the constraint hold later only (`between`).",
                 DraxWarning,
                 stacklevel=2,
             )

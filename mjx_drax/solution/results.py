@@ -398,7 +398,8 @@ def optimality(found: Any, chain: int) -> str:
     if not np.isfinite(residual):
         return "residual not known"
     if residual < tolerance:
-        return f"residual {residual:.1e}, below {tolerance:g}"
+        digits = 1 if float(f"{residual:.1e}") < tolerance else 3  # 9.96e-05 is no 1.0e-04
+        return f"residual {residual:.{digits}e}, below {tolerance:g}"
     unfinished = "was interrupted" if found.interrupted else "is unfinished (max_iterations)"
     how = {STALLED: ": the polish stalled", UNFINISHED: f": the polish {unfinished}"}
     return f"residual {residual:.1e}, above {tolerance:g}{how.get(found.polished[chain], '')}"

@@ -299,6 +299,8 @@ def test_optimal_is_certified_with_a_small_residual():
     assert made.verdict == "CERTIFIED and optimal"
     assert made.optimality == "residual 1.0e-06, below 0.0001"
     assert made.polished == ["converged", "unfinished", "none", "converged"]
+    close = replace(made, residual=np.full(4, 9.96e-5))
+    assert close.optimality == "residual 9.960e-05, below 0.0001"
     others = replace(made, residual=np.full(4, 1e-2))
     assert not others.optimal
     assert others.verdict == "CERTIFIED, not known to be optimal"
