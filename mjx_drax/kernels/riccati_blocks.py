@@ -53,7 +53,7 @@ def newton_steps(
     """
     chains, K, n, m = B.shape
     N, M = tile(n), tile(m)
-    soft = None if penalty is None else (1.0 / penalty)[:, None]
+    soft = [] if penalty is None else [(1.0 / penalty)[:, None]]
     A, Hxx = (padded(a, N, N) for a in (A, Hxx))
     B, Hux, Huu = padded(B, N, M), padded(Hux, M, N), padded(Huu, M, M)
     h, gx, multipliers = (padded(a, N) for a in (h, gx, multipliers))
@@ -63,12 +63,11 @@ def newton_steps(
         return block_for_each_row(body, full, arrays, WARPS, interpret)
 
     multiply = products(interpret)
-    softness = [] if soft is None else [soft]
     shapes = {"K": (M, N), "kff": (M,), "P": (N, N), "p": (N,), "Q": (M, M)}
-    shapes |= {} if soft is None else {"T": (N, N)}
-    given = A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu, *softness
-    left = launch(partial(backward, K, n, m, multiply, bool(softness)), shapes, *given)
-    factors = [left[name] for name in shapes if name != "Q"] + softness
+    shapes |= {"T": (N, N)} if soft else {}
+    given = A, B, h, multipliers, gx, padded(gu, M), Hxx, Hux, Huu, *soft
+    left = launch(partial(backward, K, n, m, multiply, bool(soft)), shapes, *given)
+    factors = [left[name] for name in shapes if name != "Q"] + soft
     shapes = {"dx": (N,), "du": (M,), "rate": (N,)}
     white = []
     if xi_u is not None and xi_e is not None:
@@ -79,11 +78,11 @@ def newton_steps(
             return solve_upper(cholesky(Q[:m, :m]), xi_u), kicks
 
         over_stages = jax.vmap(colored, in_axes=(None, 0, 0, 0, 0))
-        amounts = jnp.zeros(chains) if soft is None else soft[:, 0]
+        amounts = soft[0][:, 0] if soft else jnp.zeros(chains, A.dtype)
         of_u, of_x = jax.vmap(over_stages)(amounts, left["Q"], left["P"], xi_u, xi_e)
         white = [padded(of_u, M), padded(of_x, N)]
         shapes |= {"noise_x": (N,), "noise_u": (M,)}
-    program = partial(forward, K, bool(softness), bool(white))
+    program = partial(forward, K, bool(soft), bool(white))
     step = launch(program, shapes, A, B, h, multipliers, *factors, *white)
     sizes = {"du": m, "noise_u": m}
     found = {name: a[..., : sizes.get(name, n)] for name, a in step.items()}

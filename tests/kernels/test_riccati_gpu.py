@@ -17,7 +17,7 @@ JAX = tuple(map(int, jax.__version__.split(".")[:2]))
 
 
 def batch(chains, dtype, noisy=True, ndx=NDX, soft=True):
-    """A different problem for every chain, penalties included, if there are `soft` dynamics."""
+    """A different problem for every chain, penalties included; none if not `soft`."""
     rng = np.random.default_rng(0)
     n = ndx + NU
     A, B, h = (rng.normal(size=(chains, K, ndx, *m)) for m in [(ndx,), (NU,), ()])
@@ -49,6 +49,9 @@ def agree(seen, wanted, tolerance):
 KINDS = [(True, True), (False, True), (False, False), (True, False)]
 """Noise, and a penalty: the flow has one, the polish neither."""
 
+INFINITE = (False, True, np.inf)
+"""A penalty that is a number all the same."""
+
 
 @pytest.mark.parametrize(("noisy", "soft"), KINDS)
 def test_it_agrees_with_the_plain_recursion(noisy, soft):
@@ -58,10 +61,12 @@ def test_it_agrees_with_the_plain_recursion(noisy, soft):
         agree(newton_steps(*arrays_of(arguments), interpret=True), plain, 1e-9)
 
 
-@pytest.mark.parametrize(("noisy", "soft"), KINDS)
-def test_blocks_agree_with_the_plain_recursion(noisy, soft):
+@pytest.mark.parametrize(("noisy", "soft", "penalty"), [(*k, None) for k in KINDS] + [INFINITE])
+def test_blocks_agree_with_the_plain_recursion(noisy, soft, penalty):
     with jax.enable_x64(True):
         arguments = batch(2, np.float64, noisy, ndx=17, soft=soft)  # a tile of 32
+        if penalty:
+            arguments = (*arguments[:3], jnp.full(2, penalty), arguments[-1])
         plain = jax.jit(jax.vmap(newton))(*arguments)
         seen = riccati_blocks.newton_steps(*arrays_of(arguments), interpret=True)
         agree(seen, plain, 1e-9)
