@@ -2,8 +2,8 @@
 
 Decisions between the iterations, from costs alone. Costs are measured from the problem's floor, and
 are infinite where a chain is not sound. A chain is done if its cost exceeds the best by at most a
-share. An attempt, with noise or without, has a place for each chain, and works for those that are
-not done: several places for one, maybe. Two questions are answered by rates, in chains that become
+share. An attempt, with noise or without, has at least a place for each chain. What its places find
+goes to the chains that are not done. Two questions are answered by rates, in chains that become
 done for each iteration:
 
     wait longer?    while another attempt like this one would not bring the missing chains faster
@@ -34,70 +34,81 @@ class AttemptSoFar:
     """How an attempt at one problem stands.
 
     Attributes:
-        owners: for which chain each place works, (places,).
         active: which places still move, (places,).
         cost, before: costs of places, now and when this was asked last, (places,).
         bar: up to which cost chains are done.
-        kept: which chains were done before the attempt, (chains,).
-        needless: how many chains need not be done.
+        wanted: how many places must find what makes a chain done; before the first attempt as
+            `wanted` says, later as many as there are chains that were not done.
+        needless: of them this many may fail to.
         iterations, since: of the attempt, and since this was asked last.
+        wider: places of another attempt, for each of this one's.
     """
 
-    owners: np.ndarray
     active: np.ndarray
     cost: np.ndarray
     before: np.ndarray
     bar: float
-    kept: np.ndarray
+    wanted: int
     needless: float
     iterations: int
     since: int
+    wider: float
 
     @property
     def near(self) -> np.ndarray:
-        """Places that make their chains done, (places,)."""
+        """Places that have found what makes a chain done, (places,)."""
         return self.cost <= self.bar
 
     @property
     def hopeful(self) -> np.ndarray:
-        """Places that do, or that are not sound yet and may, (places,)."""
+        """Places that have, or that are not sound yet and may, (places,)."""
         return self.near | np.isinf(self.cost)
 
-    def gained(self, places: np.ndarray) -> int:
-        """How many chains these places make done that were not."""
-        done = np.zeros(len(self.kept), bool)
-        done[self.owners[places]] = True
-        return int((done & ~self.kept).sum())
-
     def missing(self, places: np.ndarray) -> float:
-        """How many more chains must become done if these places make theirs done."""
-        return float((~self.kept).sum() - self.gained(places) - self.needless)
+        """How many more places must find it if each of these does."""
+        return float(self.wanted - self.needless - places.sum())
+
+    @property
+    def looks_on(self) -> bool:
+        """Whether the chains were done before, and the attempt only looks for better optima."""
+        return self.wanted <= self.needless
 
     @property
     def waited_for(self) -> np.ndarray:
         """Active places that matter, (places,).
 
-        If another attempt will be made, those that are not far too expensive, as these start again.
+        If another attempt will be made, those that are not far too expensive, as these start again;
+        and if all chains are done.
         """
-        return self.active & self.hopeful if self.missing(self.hopeful) > 0.0 else self.active
+        some = self.looks_on or self.missing(self.hopeful) > 0.0
+        return self.active & self.hopeful if some else self.active
 
     @property
     def over(self) -> bool:
         """Whether to end the attempt, where a finish will polish the places that are left.
 
-        First case: enough chains are done, and some have several places. (Where each place works
-        for a chain of its own, the finish is the same as waiting.) Second case: another attempt is
-        needed, and would bring more chains than waiting. Of waiting one chain more is expected than
-        came since this was asked last (Laplace's rule of succession), so that a few chains do not
-        decide by chance.
+        First case: enough chains are done, and there are more places than are wanted. (Else the
+        finish is the same as waiting.) Second case: another attempt is needed, and would
+        bring more chains than waiting. Of waiting one chain more is expected than came since this
+        was asked last (Laplace's rule of succession), so that a few chains do not decide by chance.
         """
+        if self.looks_on:
+            return False
         if self.missing(self.near & ~self.active) <= 0.0:
-            return int(np.bincount(self.owners).max()) > 1
+            return len(self.active) > self.wanted
         if self.missing(self.hopeful) <= 0.0:
             return False
-        now, before = self.gained(self.near), self.gained(self.before <= self.bar)
-        another = min(now, self.missing(self.near)) / self.iterations
-        return (max(now - before, 0) + 1) / self.since < another
+        now, before = self.near.sum(), (self.before <= self.bar).sum()
+        another = min(self.wider * now, self.missing(self.near)) / self.iterations
+        return bool((max(now - before, 0) + 1) / self.since < another)
+
+
+def wanted(chains: int, places: int) -> int:
+    """How many places of the first attempt must find what makes a chain done.
+
+    One for each chain, and half of them: if all find different optima, there may be better ones.
+    """
+    return max(chains, places // 2)
 
 
 def done_up_to(
@@ -123,25 +134,35 @@ def done_up_to(
     return np.where(known, best + margin, -np.inf)
 
 
-def noise_is_better(done: np.ndarray, iterations: np.ndarray) -> bool:
-    """Whether attempts with noise bring at least as many chains for each iteration.
+def noise_is_better(done: np.ndarray, work: np.ndarray) -> bool:
+    """Whether attempts with noise bring at least as many chains for each iteration of a place.
 
-    done and iterations, (2,), are those of an attempt without and of one with noise.
+    done and work, (2,), are those of an attempt without and of one with noise: places that found
+    what makes a chain done, and places times iterations.
     """
-    return bool(done[1] * iterations[0] >= done[0] * iterations[1])
+    return bool(done[1] * work[0] >= done[0] * work[1])
 
 
-def owners_of_places(done: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """For which chain each place works: those that are not done, the worst first, (..., chains).
+def owners_of_places(done: np.ndarray, cost: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Which chain gets what each place has found, (..., places).
 
-    If all are done, for the first one.
+    The worst of the chains that are not done gets the best, and so on, in turns. If all are done,
+    the first one gets everything.
+
+    Args:
+        done: which chains are, (..., chains).
+        cost: of what they have, (..., chains).
+        order: the places, those that found the best first, (..., places).
     """
-    order = np.argsort(-cost, axis=-1, kind="stable")
-    done_last = np.argsort(np.take_along_axis(done, order, -1), axis=-1, kind="stable")
-    unfinished = np.take_along_axis(order, done_last, -1)
+    worst = np.argsort(-cost, axis=-1, kind="stable")
+    done_last = np.argsort(np.take_along_axis(done, worst, -1), axis=-1, kind="stable")
+    unfinished = np.take_along_axis(worst, done_last, -1)
     count = (~done).sum(axis=-1, keepdims=True)
-    turn = np.arange(done.shape[-1]) % np.maximum(count, 1)
-    return np.where(count > 0, np.take_along_axis(unfinished, turn, -1), 0)
+    turn = np.arange(order.shape[-1]) % np.maximum(count, 1)
+    takers = np.where(count > 0, np.take_along_axis(unfinished, turn, -1), 0)
+    owners = np.empty_like(order)
+    np.put_along_axis(owners, order, takers, -1)
+    return owners
 
 
 def stricter(cost_scale: np.ndarray, feasible: np.ndarray) -> np.ndarray:

@@ -62,6 +62,22 @@ class Chains:
         """The cost of what is sound, and infinity of the rest, (rows,)."""
         return np.where(self.sound, self.cost, np.inf)
 
+    def order(self, problems: int = 1) -> np.ndarray:
+        """The rows of each of so many problems, numbered from 0, best first, (problems, rows each).
+
+        Feasible beats infeasible, then sound beats what its replay missed, then the cheaper or the
+        less infeasible wins; the earlier one of equals.
+        """
+        infeasible, value = ranking(self.cost, self.info.max_defect)
+        keys = (a.reshape(problems, -1) for a in (value, self.missed, infeasible))
+        return np.lexsort(tuple(keys), axis=-1)
+
+    def at(self, rows: np.ndarray) -> Chains:
+        """Those rows."""
+        info = jax.tree.map(lambda a: np.asarray(a)[rows], self.info)
+        state = taken(self.state, rows)
+        return Chains(state, info, self.feasible_since[rows], self.missed[rows])
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -77,16 +93,16 @@ class Stage:
         todo: problems of this attempt.
         place: how many of them are done; the chunk is what follows.
         begun: whether `now` belongs to this chunk; else it has not begun.
-        owners: for which of its problem's chains each row works, (rows,).
         kept: the best so far of all chains of all problems, (N * chains,); None before any.
         now: where the chunk's chains are, (rows,).
         before: `now.sound_cost` when it was asked last whether to wait, (rows,).
         damping: of each row between rollouts, (rows,); inf for rows that they cannot improve.
         step: how many of the attempt's iterations are done.
         ends: of a single problem, `sound_cost` of the places when the latest attempts without and
-            with noise ended, (2, chains), and after how many iterations they did, `steps` (2,).
+            with noise ended, and places times iterations of these, `work` (2,).
         rollouts: how many rollouts, and rounds of them, are done.
-        records: iterations done and diagnostics of the rows, for every report of a single problem.
+        records: iterations done and diagnostics of the best places, as many as there are chains,
+            for every report of a single problem.
         began: for every attempt, and every start of it, after how many iterations it began and its
             noise ended.
         coolings: how often an attempt has started again with less noise.
@@ -100,14 +116,13 @@ class Stage:
     todo: np.ndarray
     place: int
     begun: bool
-    owners: np.ndarray
     kept: Chains | None
     now: Chains
     before: np.ndarray
     damping: np.ndarray
     step: int
-    ends: np.ndarray
-    steps: np.ndarray
+    ends: tuple[np.ndarray, np.ndarray]
+    work: np.ndarray
     rollouts: int
     records: tuple[tuple[int, Info], ...]
     began: tuple[tuple[int, int], ...] = ()
@@ -143,21 +158,25 @@ def improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
 
 
 def finished(kept: Chains, now: Chains) -> Chains:
-    """The chains after more polish; as they were kept where that has made them worse."""
-    worse = np.where(now.sound, now.cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
+    """The chains after more polish; as they were kept where that has made them worse.
+
+    The first rows of `now` are the chains; the others are the same again.
+    """
+    rows = slice(len(kept.missed))
+    cost, sound = now.cost[rows], now.sound[rows]
+    worse = np.where(sound, cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
     source = np.arange(len(worse)) + len(worse) * ~worse
     state, info = gather((kept.state, kept.info), (now.state, now.info), source)
-    since = np.where(worse, kept.feasible_since, now.feasible_since)
-    return Chains(state, info, since, np.where(worse, kept.missed, now.missed))
+    since = np.where(worse, kept.feasible_since, now.feasible_since[rows])
+    return Chains(state, info, since, np.where(worse, kept.missed, now.missed[rows]))
 
 
 def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
-    """For every chain the best of what it has and of what was found for it.
+    """For every chain the best of what it has and what was found for it, as `Chains.order` ranks.
 
-    owners (chains,) says for which chain each row of `found` has worked. Feasible beats infeasible,
-    then sound beats what its replay missed, then the cheaper or the less infeasible wins.
+    owners (rows of found,) says for which chain each row of `found` is.
     """
-    chains = len(owners)
+    chains = len(kept.missed)
 
     def both(values: Callable[[Chains], ArrayLike]) -> np.ndarray:
         return np.concatenate([np.asarray(values(kept)), np.asarray(values(found))])
@@ -188,7 +207,7 @@ def gather(kept: Any, found: Any, source: Array) -> Any:
 
     def rows(a: Array, b: Array) -> Array:
         mine = (source < chains).reshape(-1, *[1] * (a.ndim - 1))
-        return jnp.where(mine, a[source % chains], b[source % chains])
+        return jnp.where(mine, a[source % chains], b[jnp.maximum(source - chains, 0)])
 
     return jax.tree.map(rows, kept, found)
 

@@ -40,6 +40,7 @@ from mjx_drax.search.attempts import (
     owners_of_places,
     stricter,
     temperature,
+    wanted,
 )
 from mjx_drax.search.chains import (
     CHEAPER,
@@ -153,6 +154,7 @@ class Search:
     question: tuple[Question, Question] = field(init=False)
     launch: Callable[..., Any] = field(init=False)
     clock: float = field(init=False, default=0.0)
+    compiling: float = field(init=False, default=0.0)
 
     def run(self) -> Found:
         """All attempts; Ctrl-C keeps what there is."""
@@ -165,7 +167,7 @@ class Search:
         answered = ended
         if not answered:
             self._compile_the_rest()
-        compile_time = time.perf_counter() - clock
+        self.compiling = time.perf_counter() - clock
 
         self.clock = time.perf_counter() - before
         try:
@@ -188,7 +190,7 @@ class Search:
             found, _ = self._no_worse(found, self._guessed())
         stage, solve_time = self.stage, time.perf_counter() - self.clock
         records, began = list(stage.records), list(stage.began)
-        return Found(found, records, began, first, compile_time, solve_time)
+        return Found(found, records, began, first, self.compiling, solve_time)
 
     # Attempts and chunks
 
@@ -203,6 +205,11 @@ class Search:
         """Problems of the second program; 0: there is none."""
         many = self.size * self.chains >= MANY and self.mesh is None and self.polish is not None
         return self.size // FEWER if many and not self.family.alone else 0
+
+    def places(self, attempt: int) -> int:
+        """Of a problem in that attempt."""
+        one_each = not self.family.alone or self.guess is not None
+        return self.chains if one_each else self.settings.places(self.chains, attempt)
 
     @property
     def width(self) -> int:
@@ -219,13 +226,14 @@ class Search:
     def _begin_search(self) -> None:
         """Initial knots of the first chunk, tried before anything long compiles."""
         family, everyone = self.family, np.arange(self.family.count)
-        rows, scale = self.size * self.chains, np.ones(family.count)
+        places, scale = self.places(0), np.ones(family.count)
+        rows = self.size * places
         indices = np.resize(everyone, self.size)
         knots, keys = self._drawn(0, indices)
         saved = self.checkpoint is not None and self.checkpoint.found is not None
         one = family.at(0)
         if not saved:
-            mine = knots if family.alone else jax.tree.map(lambda a: a[: self.chains], knots)
+            mine = knots if family.alone else jax.tree.map(lambda a: a[:places], knots)
             flow = self.settings.first(1.0)
             with_f = not family.problem.dynamics.checked
             require_sound(flow, one, mine, with_f, family.alone)
@@ -238,7 +246,6 @@ class Search:
             require_finite(self.flow, one, state.trajectory, info.cost, info.max_defect)
         now = Chains.of(state, info, np.full(rows, -1))
         kept = None if family.alone else unset(now, family.count * self.chains)
-        owners, ones = np.tile(np.arange(self.chains), self.size), np.ones(rows)
         self.stage = Stage(
             attempt=0,
             heated=False,
@@ -248,22 +255,21 @@ class Search:
             todo=everyone,
             place=0,
             begun=True,
-            owners=owners,
             kept=kept,
             now=now,
             before=now.sound_cost,
-            damping=ones,
+            damping=np.ones(rows),
             step=0,
-            ends=np.full((2, self.chains), np.inf),
-            steps=np.ones(2, int),
+            ends=(np.full(1, np.inf),) * 2,
+            work=np.ones(2, int),
             rollouts=0,
-            records=((0, info),),
+            records=((0, self._best(now)),),
         )
         self._measure()
 
     def _compile(self, state: State) -> Info:
         """Compile what iterates; the diagnostics of a chunk's states."""
-        if not self.few or len(state.alive) < self.size * self.chains:
+        if not self.few:
             return self._iterated(state, 0, 0)[1]
         with ThreadPoolExecutor(1) as pool:
             wide = jnp.result_type(float) == jnp.float64
@@ -281,6 +287,15 @@ class Search:
             begin(taken(own, rows), shared, replace(knots, slack=None), keys)
             nothing = Info.of(np.zeros(len(state.alive)))
             self._go_on(state, nothing, rows, 0, 0)
+
+    def _compile_more(self, kept: Chains) -> None:
+        """Compile for the places of later attempts, once one is made and if they are more."""
+        clock = time.perf_counter()
+        later, info = self._iterated(self._begun(1, *self._drawn(1, self.indices)), 0, 0)
+        both = (kept.state, kept.info), (gathered(later, self.mesh), info)
+        jax.block_until_ready(gather(*both, np.arange(self.chains)))
+        seconds = time.perf_counter() - clock
+        self.compiling, self.clock = self.compiling + seconds, self.clock + seconds
 
     def _begun(self, attempt: int, knots: Trajectory, keys: Array) -> State:
         """The first state of every row of an attempt."""
@@ -309,26 +324,21 @@ class Search:
     def _begin_chunk(self) -> None:
         """New initial knots and random numbers for every row."""
         stage, indices = self.stage, self.indices
-        owners = np.tile(np.arange(self.chains), len(indices))
-        if stage.attempt > 0:
-            assert stage.kept is not None
-            assert self.settings.done_share is not None
-            cost, bar = self._sound_costs(stage.kept, indices), self._done_up_to(indices)
-            left_alone = (cost <= bar) & (self.settings.done_share <= 1.0)
-            owners = owners_of_places(left_alone, cost).ravel()
-        knots, keys = self._drawn(stage.attempt, indices)
         self._settle(stage.attempt, stage.heated, indices, stage.cost_scale)
+        if stage.attempt == 1 and self.places(1) > self.places(0):
+            assert stage.kept is not None
+            self._compile_more(stage.kept)
+        knots, keys = self._drawn(stage.attempt, indices)
         state = self._begun(stage.attempt, knots, keys)
         _, info = self._iterated(state, 0, 0)
-        now = Chains.of(state, info, np.full(len(owners), -1))
-        ones = np.ones(len(owners))
+        rows = len(indices) * self.places(stage.attempt)
+        now = Chains.of(state, info, np.full(rows, -1))
         self.stage = replace(
             stage,
             begun=True,
-            owners=owners,
             now=now,
             before=now.sound_cost,
-            damping=ones,
+            damping=np.ones(rows),
             step=0,
             rollouts=0,
         )
@@ -343,7 +353,7 @@ class Search:
         shared, own = self.question
         knots = gathered(stage.now.state.trajectory, self.mesh)
         sizes = jax.tree.map(np.asarray, sizes_of(own, shared, replace(knots, slack=None)))
-        of_problem = jax.tree.map(lambda a: a.reshape(-1, self.chains), sizes)
+        of_problem = jax.tree.map(lambda a: a.reshape(len(indices), -1), sizes)
         scale, floor = stage.cost_scale.copy(), stage.floor.copy()
         scale[indices], floor[indices] = scale_and_floor(of_problem, self.polish is not None)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
@@ -352,12 +362,15 @@ class Search:
     def _next_chunk(self) -> None:
         """Keep the best of the chunk, and go on to the next one."""
         stage, kept = self.stage, self._merged()
-        ends, steps = stage.ends.copy(), stage.steps.copy()
+        ends, work = list(stage.ends), stage.work.copy()
         if self.family.alone:
             kind = int(stage.heated)
-            ends[kind], steps[kind] = stage.now.sound_cost, max(stage.step, 1)
+            ends[kind] = stage.now.sound_cost
+            work[kind] = max(stage.step, 1) * len(ends[kind])
         place = min(stage.place + self.width, len(stage.todo))
-        self.stage = replace(stage, kept=kept, ends=ends, steps=steps, place=place, begun=False)
+        self.stage = replace(
+            stage, kept=kept, ends=(ends[0], ends[1]), work=work, place=place, begun=False
+        )
         if not self.family.alone:
             self._save()
             if self.chunk_done is not None:
@@ -380,14 +393,18 @@ class Search:
             assert self.polish is not None
             return stage.finishing < self.polish.patience and self._begin_to_finish()
         bar = self._done_up_to(everyone)
-        unfinished = (self._sound_costs(kept, everyone) > bar).sum(axis=1)
-        todo = np.flatnonzero(unfinished > (1.0 - settings.done_share) * self.chains)
+        missing = (self._sound_costs(kept, everyone) > bar).sum(axis=1)
+        found = np.array([(end - stage.floor[0] <= bar[0]).sum() for end in stage.ends])
+        many = self.chains
+        if family.alone and stage.attempt == 0:
+            many = wanted(self.chains, self.places(0))
+            missing = np.maximum(many - found[:1], 0)
+        todo = np.flatnonzero(missing > (1.0 - settings.done_share) * many)
         if stage.attempt + 1 == settings.attempts or not len(todo):
             return self._begin_to_finish()
         heated = bool(settings.heated)
         if family.alone:
-            found = (stage.ends - stage.floor[0] <= bar[0]).sum(axis=1)
-            better = noise_is_better(found, stage.steps)
+            better = noise_is_better(found, stage.work)
             if settings.heated is None:
                 heated = better if found.any() else not stage.heated
             elif stage.attempt > 0 and not self._thorough:
@@ -408,22 +425,28 @@ class Search:
         if not unfinished.any():
             return False
         done = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
+        now = kept if len(self._again) == self.chains else kept.at(self._again)
         self.stage = replace(
             stage,
             finishing=stage.finishing + 1,
             begun=True,
             place=0,
-            owners=np.arange(self.chains),
-            now=kept,
-            before=kept.sound_cost,
+            now=now,
+            before=now.sound_cost,
             # the first only moves knots inside their bounds
             step=self.flow.iterations + max(done % (self.settings.after - 1), 1),
             began=(*stage.began, (stage.done, stage.done)),
         )
         if self.recorder is not None:
-            self.recorder.begin(self.stage.owners, continues=True)
+            self.recorder.begin(continues=True)
+            self.recorder.belong(self._again)
         self._record()
         return True
+
+    @property
+    def _again(self) -> np.ndarray:
+        """Which chain each place of the first attempt's has, where all go on, (places,)."""
+        return np.resize(np.arange(self.chains), self.places(0))
 
     @property
     def _ends_early(self) -> bool:
@@ -481,8 +504,8 @@ class Search:
             costs.append(self._sound_costs(kept, indices))
             sizes.append(np.asarray(kept.info.size).reshape(-1, self.chains)[indices])
         if now is not None:
-            costs.append(now.sound_cost.reshape(n, self.chains) - stage.floor[indices, None])
-            sizes.append(np.asarray(now.info.size).reshape(n, self.chains))
+            costs.append(now.sound_cost.reshape(n, -1) - stage.floor[indices, None])
+            sizes.append(np.asarray(now.info.size).reshape(n, -1))
         assert self.settings.within is not None
         both = np.concatenate(costs, axis=1), np.concatenate(sizes, axis=1)
         return done_up_to(*both, self.settings.within, stage.cost_scale[indices])
@@ -490,23 +513,50 @@ class Search:
     def _merged(self) -> Chains:
         """The best of all attempts, this one included."""
         stage, kept, now = self.stage, self.stage.kept, self._whole(self.stage.now)
-        if kept is None:
-            return now
         if stage.finishing:
+            assert kept is not None
             return finished(kept, now)
+        owners = self._owners(now)
+        if self.recorder is not None:
+            self.recorder.belong(owners.ravel())
+        if kept is None:
+            return now if owners.size == self.chains else now.at(np.flatnonzero(owners >= 0))
         if self.family.alone:
-            return best_of(kept, now, stage.owners)
+            return best_of(kept, now, owners.ravel())
         fresh = min(self.width, len(stage.todo) - stage.place)
         of_problem = np.arange(self.chains)
         rows = (self.indices[:fresh, None] * self.chains + of_problem).ravel()
-        first = np.repeat(np.arange(fresh) * self.chains, self.chains)
+        first = np.arange(fresh)[:, None] * self.chains
         mine, found = (
             jax.tree.map(lambda a, n=n: np.asarray(a)[n], chains)
             for chains, n in ((kept, rows), (slim(now), slice(len(rows))))
         )
-        best = best_of(mine, found, stage.owners[: len(rows)] + first)
+        best = best_of(mine, found, (owners[:fresh] + first).ravel())
         jax.tree.map(lambda a, new: a.__setitem__(rows, new), kept, best)
         return kept
+
+    def _owners(self, now: Chains) -> np.ndarray:
+        """Which of its problem's chains gets what each place of the chunk has found, (n, places).
+
+        In the first attempt at a single problem the best places are its chains, -1 elsewhere.
+        """
+        indices, kept, share = self.indices, self.stage.kept, self.settings.done_share
+        order = now.order(len(indices))
+        if kept is None:
+            owners = np.full_like(order, -1)
+            owners[0, np.sort(order[0, : self.chains])] = np.arange(self.chains)
+            return owners
+        assert share is not None
+        cost, bar = self._sound_costs(kept, indices), self._done_up_to(indices, now)
+        return owners_of_places((cost <= bar) & (share <= 1.0), cost, order)
+
+    def _best(self, now: Chains) -> Info:
+        """Of the places as many as there are chains."""
+        if len(now.missed) == self.chains:
+            return now.info
+        best = np.sort(now.order()[0, : self.chains])
+        info: Info = jax.tree.map(lambda a: np.asarray(a)[best], now.info)
+        return info
 
     def _whole(self, chains: Chains) -> Chains:
         """The chains with their states on one device."""
@@ -522,7 +572,7 @@ class Search:
                 first = self.guess
             elif attempt == 0:
                 first = self.guess.knots
-            knots = initial_knots(self.family.problem, self.chains, first, key_knots)
+            knots = initial_knots(self.family.problem, self.places(attempt), first, key_knots)
             return knots, key_noise
         keys = _keys_of(key, indices)
         guess = self.family.problem.guess
@@ -578,7 +628,7 @@ class Search:
         if self.family.alone and len(stage.began) == stage.attempt + stage.coolings:
             noisy = int(flow.iterations) if noise_at(flow, 0) > 0.0 else 0
             if self.recorder is not None:
-                self.recorder.begin(stage.owners)
+                self.recorder.begin()
             self.stage = replace(stage, began=(*stage.began, (stage.done, stage.done + noisy)))
             self._record()
         total = flow.iterations + self.settings.after
@@ -651,20 +701,20 @@ class Search:
         active = self._moving(now.state)
         if stage.attempt + 1 < settings.attempts or (self._ends_early and stage.attempt > 0):
             bar, floor = self._done_up_to(self.indices, now).item(), stage.floor[0]
-            kept = np.zeros(self.chains, bool)
+            count = wanted(self.chains, len(active))
             if stage.kept is not None:
-                kept = stage.kept.sound_cost - floor <= bar
+                count = int((stage.kept.sound_cost - floor > bar).sum())
             assert settings.done_share is not None
             so_far = AttemptSoFar(
-                owners=stage.owners,
                 active=active,
                 cost=now.sound_cost - floor,
                 before=stage.before - floor,
                 bar=bar,
-                kept=kept,
-                needless=(1.0 - settings.done_share) * self.chains,
+                wanted=count,
+                needless=(1.0 - settings.done_share) * max(self.chains, count),
                 iterations=stage.step,
                 since=usual,
+                wider=self.places(stage.attempt + 1) / len(active),
             )
             if self._ends_early and so_far.over:
                 return False
@@ -716,7 +766,8 @@ class Search:
     @property
     def _replayer(self) -> Replayer:
         """What replays the chunk's chains."""
-        indices, floor = self.indices, np.repeat(self.stage.floor[self.indices], self.chains)
+        indices, places = self.indices, len(self.stage.now.missed) // self.width
+        floor = np.repeat(self.stage.floor[indices], places)
 
         def diagnosed(state: State) -> tuple[State, Info]:
             state, info = self._iterated(state, 0, 0)  # compiled already
@@ -731,7 +782,7 @@ class Search:
         if not rollouts.asked:
             return True
         now = self._whole(stage.now)
-        better = np.zeros(len(stage.owners), bool)
+        better = np.zeros(len(now.missed), bool)
         if self.guess is not None and stage.attempt == stage.rollouts == 0:
             # The attempt may have lost contacts of the guess: rollouts then start from the guess
             guessed = self._replayer.rolled_out(self._guessed(), 0.0, stage.done)
@@ -783,7 +834,7 @@ class Search:
         if len(rows):
             knots = replace(now.state.trajectory, slack=None)
             box = box_of_controls(*reversed(self.question), knots)
-            keys = np.stack([replayer.of[rows], rows % self.chains], axis=1)
+            keys = np.stack([replayer.of[rows], rows % (len(now.missed) // self.width)], axis=1)
 
             def told(shots: Shots) -> None:
                 cost, worst = jnp.asarray(now.info.cost), jnp.asarray(now.info.max_defect)
@@ -801,7 +852,7 @@ class Search:
                 told,
             )
             found = replayer.taken(now, rows, shots, stage.done)
-            before, now = now, best_of(now, found, np.arange(len(stage.owners)))
+            before, now = now, best_of(now, found, np.arange(len(now.missed)))
             damping = np.where(_same(before, now), damping, 1.0)
         count = stage.rollouts + 1 if np.isfinite(damping).any() else rollouts.total
         self.stage = replace(stage, now=now, damping=damping, rollouts=count)
@@ -816,7 +867,7 @@ class Search:
 
     def _next_round(self) -> None:
         """A round: iterations, and the rollouts of what they have changed."""
-        stage, everyone = self.stage, np.arange(len(self.stage.owners))
+        stage, everyone = self.stage, np.arange(len(self.stage.now.missed))
         rollouts = self.settings.rollouts
         assert rollouts is not None
         now, damping, count = stage.now, stage.damping, stage.rollouts + 1
@@ -842,7 +893,7 @@ class Search:
     def _report(self, stage: Stage, done: int) -> None:
         """Go on to that stage, after `done` iterations: record it, keep it and tell."""
         if self.family.alone:
-            stage = replace(stage, records=(*stage.records, (done, stage.now.info)))
+            stage = replace(stage, records=(*stage.records, (done, self._best(stage.now))))
         self.stage = stage
         self._record()
         self._save()
@@ -868,8 +919,11 @@ class Search:
         """What would else be compiled while the clock runs."""
         now, settings = self.stage.now, self.settings
         if settings.attempts > 1 and self.family.alone:
-            rows = np.arange(len(self.stage.owners))
-            gather((now.state, now.info), (now.state, now.info), rows)
+            chains = np.arange(self.chains)
+            kept = now if len(now.missed) == self.chains else now.at(chains)
+            if len(self._again) > self.chains:
+                kept.at(self._again)
+            gather((kept.state, kept.info), (now.state, now.info), chains)
         if self.recorder is not None:
             knot_defects(self.family.problem, now.state.trajectory)
         if self.family.alone:
@@ -884,7 +938,7 @@ class Search:
         else:
             what = {"call": "solve_batch", "problems": family.count, "chunk": self.size}
         checkpoint.require({**what, **known})
-        problem, rows = family.problem, self.size * self.chains
+        problem, rows = family.problem, self.size * self.places(settings.attempts - 1)
         nx, nu, dtype = problem.dynamics.nx, problem.dynamics.nu, problem.x_init.dtype
         ones = Scale(np.ones(self.size), np.ones(self.size))
         none = np.zeros(self.size, int)
@@ -933,8 +987,11 @@ class Search:
             self.recorder.restore(saved["recorder"])
         if not saved["ended"]:
             self._settle(stage.attempt, stage.heated, self.indices, stage.cost_scale)
-            if len(self.indices) * self.chains == len(self.stage.owners):
-                self._compile(self.stage.now.state)
+            rows = len(stage.now.missed)
+            if self.family.alone or rows == len(state.alive):
+                self._compile(state)
+            if self.family.alone and rows > len(state.alive):
+                self._iterated(stage.now.state, 0, 0)
         return saved["solve_time"], saved["ended"]
 
     def _saved(self, solve_time: float, ended: bool) -> dict[str, Any]:

@@ -7,7 +7,7 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from itertools import islice
 
 import jax
@@ -59,22 +59,27 @@ class Snapshot:
         return self.x.nbytes + self.defects.nbytes + self.cost.nbytes + self.max_defect.nbytes
 
 
+_OF_ALL, _OF_PLACES = ("iteration", "sigma"), ("x", "defects", "cost", "max_defect")
+"""Names of a snapshot's numbers, and of its arrays of all places."""
+
+
 @dataclass
 class Tries:
-    """One attempt: for which chain each place in the batch worked (chains,), and its snapshots.
+    """One attempt: its snapshots, and which chain got what each place has found, (places,).
 
-    If it `continues`, chains went on from where their best attempts had left them.
+    If it `continues`, chains went on from where their best attempts had left them. `owners` is
+    empty until the attempt ends, and -1 where no chain took what was found.
     """
 
-    owners: np.ndarray
     snapshots: list[Snapshot] = field(default_factory=list)
     continues: bool = False
+    owners: np.ndarray = field(default_factory=lambda: np.array([], int))
 
     def best(self, chain: int) -> tuple[int, tuple[bool, float]] | None:
-        """The place whose end is best among those that worked for the chain, and its rank.
+        """The place whose end is best among those that the chain got, and its rank.
 
         As solves choose: feasible before infeasible, then the cheaper or the less infeasible.
-        None if no place worked for it.
+        None if it got none.
         """
         places = np.flatnonzero(self.owners == chain)
         if not len(places):
@@ -137,6 +142,11 @@ class Recording:
         )
 
 
+def _joined(arrays: list[np.ndarray]) -> np.ndarray:
+    """One after the other; nothing of nothing."""
+    return np.concatenate(arrays) if arrays else np.array([], int)
+
+
 class Recorder:
     """Takes snapshots during a solve, every few iterations and whenever an attempt ends.
 
@@ -149,9 +159,14 @@ class Recorder:
         self.every = int(every)
         self.attempts: list[Tries] = []
 
-    def begin(self, owners: np.ndarray, continues: bool = False) -> None:
-        """An attempt begins, in which each place in the batch works for the chain in owners."""
-        self.attempts.append(Tries(owners, continues=continues))
+    def begin(self, continues: bool = False) -> None:
+        """An attempt begins."""
+        self.attempts.append(Tries(continues=continues))
+
+    def belong(self, owners: np.ndarray) -> None:
+        """The latest attempt's places belong to those chains, (places,)."""
+        if self.attempts:
+            self.attempts[-1].owners = owners
 
     def take(self, problem: Problem, sigma: float, done: int, z: Trajectory, info: Info) -> None:
         """A snapshot after `done` iterations of the solve, at the noise sigma."""
@@ -172,29 +187,34 @@ class Recorder:
                 tries.snapshots = [*shots[:-1:2], shots[-1]]
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All of it, as arrays."""
+        """All of it, as arrays; those of places one after the other, as attempts differ in them."""
         shots = [shot for tries in self.attempts for shot in tries.snapshots]
+        owners = [tries.owners for tries in self.attempts]
         return {
             "every": np.array(self.every),
-            "owners": np.array([tries.owners for tries in self.attempts]),
+            "owners": _joined(owners),
+            "owned": np.array([len(a) for a in owners]),
             "continues": np.array([tries.continues for tries in self.attempts]),
             "counts": np.array([len(tries.snapshots) for tries in self.attempts]),
-            **{
-                f.name: np.array([getattr(shot, f.name) for shot in shots])
-                for f in fields(Snapshot)
-            },
+            "places": np.array([len(shot.cost) for shot in shots]),
+            **{n: np.array([getattr(shot, n) for shot in shots]) for n in _OF_ALL},
+            **{n: _joined([getattr(shot, n) for shot in shots]) for n in _OF_PLACES},
         }
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Become the recorder of which these are the arrays."""
-        rows = zip(*(saved[f.name] for f in fields(Snapshot)), strict=True)
-        shots = iter([Snapshot(int(i), float(sigma), *rest) for i, sigma, *rest in rows])
+
+        def parted(name: str, sizes: str) -> list[np.ndarray]:
+            return np.split(saved[name], np.cumsum(saved[sizes])[:-1])
+
+        rows = zip(*(parted(name, "places") for name in _OF_PLACES), strict=True)
+        both = zip(saved["iteration"].tolist(), saved["sigma"].tolist(), rows, strict=True)
+        shots = iter([Snapshot(done, sigma, *arrays) for done, sigma, arrays in both])
         self.every = int(saved["every"])
+        parts = parted("owners", "owned"), saved["continues"].tolist(), saved["counts"].tolist()
         self.attempts = [
-            Tries(owners, list(islice(shots, int(count))), bool(continues))
-            for owners, continues, count in zip(
-                *(saved[name] for name in ("owners", "continues", "counts")), strict=True
-            )
+            Tries(list(islice(shots, count)), continues, owners)
+            for owners, continues, count in zip(*parts, strict=True)
         ]
 
     def recording(self) -> Recording:

@@ -2,11 +2,12 @@
 
 The first attempt of every chain is a noise-free flow. It solves a problem that is not a trap, and
 it measures what a trap's annealing needs to know: the scale of costs of answers. Each further
-attempt works on the chains that are not done: infeasible, or far more expensive than the best.
-They start again from new random knots, are heated to a temperature of that scale, and are cooled
-slowly; or they descend slowly, if on this problem that brings more (`attempts`). Chains that are
-done leave their places in the batch to those that are not, so an attempt makes several tries for
-each, and every chain keeps the best that was found for it.
+attempt works for the chains that are not done: infeasible, or far more expensive than the best.
+All places in the batch start again from new random knots, are heated to a temperature of that
+scale, and are cooled slowly; or they descend slowly, if on this problem that brings more
+(`attempts`). What they find goes to the chains that are not done, the best to the worst of them,
+and every chain keeps the best that it got. On GPUs, which have room for more rows than a few dozen
+chains fill, an attempt has several places for each chain.
 
 Schedules are multiples of scales that are measured, so no setting depends on the units of a cost:
 
@@ -38,6 +39,7 @@ from mjx_drax.base.errors import (
     require_whole,
     shown,
 )
+from mjx_drax.kernels.batching import on_gpu
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Geometric, Scale
 from mjx_drax.polish.interior_point import Polish
@@ -51,6 +53,11 @@ DONE_SHARE, DONE_SHARE_KINKED = 0.95, 0.9
 WITHIN, WITHIN_KINKED = 0.1, 1.0
 """Default excess over the best cost up to which a chain is done."""
 
+
+ROOM, MOST_PLACES, TRIES = 1024, 4096, 4
+"""Places that a GPU has room for: fewer are hardly faster. A first attempt has no more, unless each
+chain needs one. Four times as many take half the time that four attempts would; default tries make
+up to MOST_PLACES, and TRIES for each chain."""
 
 TOLERANCE = {4: 1e-4, 8: 1e-8}
 """Of the polish, by the bytes of a number."""
@@ -128,6 +135,10 @@ class Restarts:
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
             `Polish()` with the tolerance of the precision, unless derivatives are sampled or the
             metric is not `polished`, as `GaussNewton` is.
+        tries: places for each chain in an attempt at a single problem without a guess; the best of
+            what they find is kept. The first attempt, which many problems do not go beyond, has
+            1,024 places or one for each chain. None: 4 on GPUs, or as many as make 4,096 places;
+            1 on CPUs, and where rollouts follow.
     """
 
     flow: Langevin = field(
@@ -147,6 +158,7 @@ class Restarts:
     heated: bool | None = None
     rollouts: Rollouts | None = None
     polish: Polish | None = None
+    tries: int | None = None
 
     @property
     def after(self) -> int:
@@ -166,13 +178,18 @@ class Restarts:
         first = flow.iterations if self.descent is None else self.descent
         return [first + i * (flow.iterations + self.after) for i in range(self.attempts)]
 
+    def places(self, chains: int, attempt: int) -> int:
+        """Of an attempt at a single problem."""
+        assert self.tries is not None
+        return chains * (self.tries if attempt else max(min(self.tries, ROOM // chains), 1))
+
     def first(self, cost_scale: float) -> Langevin:
         """The settings of the first attempt, for a scale of costs."""
         if self.descent is None:
             return self.flow
         return replace(self.flow, iterations=self.descent, scale=scale_of(cost_scale, 0.0))
 
-    def for_problem(self, problem: Problem) -> Restarts:
+    def for_problem(self, problem: Problem, chains: int) -> Restarts:
         """The same settings, with a value for each that is None."""
         kinked, polish = problem.dynamics.kinked, self.polish or self._polish_for(problem)
         rolled_out = kinked and replace(self, polish=polish).after >= Rollouts.iterations
@@ -181,6 +198,7 @@ class Restarts:
             "done_share": DONE_SHARE_KINKED if kinked else DONE_SHARE,
             "heated": None if kinked else True,
             "rollouts": Rollouts() if rolled_out else Rollouts(first=0, rounds=0),
+            "tries": 1 if rolled_out or not on_gpu() else min(max(MOST_PLACES // chains, 1), TRIES),
             "polish": polish,
         }
         return replace(self, **{n: v for n, v in values.items() if getattr(self, n) is None})
@@ -211,6 +229,8 @@ class Restarts:
         if self.descent is not None:
             require_whole("descent", self.descent, 0)
         require_whole("attempts", self.attempts)
+        if self.tries is not None:
+            require_whole("tries", self.tries)
         if self.within is not None:
             require_not_negative("within", self.within)
         if self.done_share is not None:
@@ -239,7 +259,7 @@ def as_restarts(solver: Langevin | Restarts | None) -> Restarts:
     if solver is None:
         return Restarts()
     if isinstance(solver, Langevin):
-        return Restarts(solver, descent=None, attempts=1, polish=Polish(iterations=0))
+        return Restarts(solver, descent=None, attempts=1, tries=1, polish=Polish(iterations=0))
     if not isinstance(solver, Restarts):
         raise DraxError(f"solver is {shown(solver)}: give a Langevin or a Restarts.")
     return solver
@@ -273,7 +293,7 @@ def settled(
         require_positive("max_seconds", max_seconds)
     settings = as_restarts(solver)
     settings.check(problem)
-    settings = _polished(settings, problem, tolerance, max_iterations).for_problem(problem)
+    settings = _polished(settings, problem, tolerance, max_iterations).for_problem(problem, chains)
     rollouts = settings.rollouts
     if rollouts and rollouts.asked and rollouts.iterations > settings.after:
         raise DraxError(

@@ -11,28 +11,32 @@ from mjx_drax.search.attempts import (
     owners_of_places,
     stricter,
     temperature,
+    wanted,
 )
 
 INF = np.inf
 
 
-def so_far(cost, active, before=None, kept=None, owners=None, **rest):
+def so_far(cost, active, before=None, **rest):
     cost = np.asarray(cost, float)
-    count = len(cost)
-    given = {"bar": 1.0, "needless": 0.0, "iterations": 100, "since": 20} | rest
+    usual = {"bar": 1.0, "wanted": len(cost), "needless": 0.0, "iterations": 100}
+    usual |= {"since": 20, "wider": 1.0}
     return AttemptSoFar(
-        owners=np.arange(count) if owners is None else np.asarray(owners),
         active=np.asarray(active, bool),
         cost=cost,
         before=cost if before is None else np.asarray(before, float),
-        kept=np.zeros(count, bool) if kept is None else np.asarray(kept, bool),
-        **given,
+        **(usual | rest),
     )
 
 
-def test_the_worst_chains_get_most_places():
+def test_the_worst_chains_get_the_best_that_was_found():
     done, cost = np.array([False, True, False, False]), np.array([2.0, 1.0, INF, 5.0])
-    np.testing.assert_array_equal(owners_of_places(done, cost), [2, 3, 0, 2])
+    best_first = np.array([3, 0, 4, 2, 1])
+    np.testing.assert_array_equal(owners_of_places(done, cost, best_first), [3, 3, 2, 2, 0])
+    both = np.stack([done, ~done]), np.stack([cost, cost]), np.stack([best_first] * 2)
+    np.testing.assert_array_equal(owners_of_places(*both), [[3, 3, 2, 2, 0], [1] * 5])
+    everyone = np.ones(4, bool)
+    np.testing.assert_array_equal(owners_of_places(everyone, cost, best_first), [0] * 5)
 
 
 def test_defects_are_penalized_more_where_few_chains_are_feasible():
@@ -58,11 +62,21 @@ def test_all_active_places_are_waited_for_unless_another_attempt_will_be_made():
     np.testing.assert_array_equal(may.waited_for, active)
 
 
+def test_an_attempt_that_only_looks_for_better_optima_ends_when_nothing_may_be_one():
+    at = so_far([0.9, 0.95, 7.0, INF], [False, True, True, True], wanted=1, needless=1.0)
+    assert not at.over
+    np.testing.assert_array_equal(at.waited_for, [False, True, False, True])
+
+
+def test_half_of_the_places_must_agree_in_the_first_attempt():
+    assert [wanted(64, places) for places in (64, 128, 192, 256)] == [64, 64, 96, 128]
+
+
 def test_an_attempt_is_over_once_enough_chains_have_settled():
     assert not so_far([0.9, 0.9], [False, True]).over  # no other attempt would follow
     assert not so_far([0.9, 0.9], [False, True], needless=1.0).over  # nor a finish do more
-    assert so_far([0.9, 0.9], [False, True], owners=[0, 0], kept=[False, True]).over
-    assert not so_far([0.9, INF], [True, True], owners=[0, 0], kept=[False, True]).over
+    assert so_far([0.9, 0.9], [False, True], wanted=1).over
+    assert not so_far([0.9, INF], [True, True], wanted=1).over
 
 
 def test_an_attempt_is_over_when_another_brings_chains_faster():
@@ -76,14 +90,13 @@ def test_an_attempt_is_over_when_another_brings_chains_faster():
     assert not fewer.over  # three are not feasible for the moment
     late = replace(at, iterations=1000)
     assert not late.over  # one more in 20 is not slower than 40 in 1,000
+    assert replace(late, wider=4.0, wanted=400).over  # but slower than 160 in 1,000
+    assert not replace(late, wider=4.0, wanted=85).over  # of which 45 are missing
 
 
-def test_places_that_work_for_one_chain_count_once():
-    cost, owners = [0.9, 0.9, 0.9, 7.0], [2, 2, 2, 2]
-    at = so_far(cost, [False] * 4, kept=[True, True, False, True], owners=owners)
-    assert at.gained(at.near) == 1
-    assert at.missing(at.near) == 0.0
-    assert so_far(cost, [False] * 4, owners=owners).missing(at.near) == 3.0
+def test_each_place_that_finds_what_is_wanted_makes_a_chain_done():
+    at = so_far([0.9, 0.9, 0.9, 7.0], [False] * 4, wanted=5, needless=0.5)
+    assert at.missing(at.near) == 1.5
 
 
 def test_noise_goes_on_where_it_brought_as_many_chains_for_each_iteration():

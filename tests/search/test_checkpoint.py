@@ -26,7 +26,7 @@ from mjx_drax import (
 from mjx_drax.base import digests
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.base.pytrees import register_dataclass
-from mjx_drax.search import checkpoint, engine, recording
+from mjx_drax.search import checkpoint, engine, recording, restarts
 from mjx_drax.search.engine import Search
 from mjx_drax.search.iterate import iterate
 from mjx_drax.search.restarts import Rollouts
@@ -215,6 +215,21 @@ def test_a_recording_goes_on_too(limit, stops, tmp_path, monkeypatch):
     assert_same(solved(record=3, checkpoint=file), whole)
     with pytest.raises(DraxError, match="record 3, and this solve has record None"):
         solved(checkpoint=file)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("often")
+def test_attempts_of_different_sizes_go_on_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(restarts, "ROOM", 2 * CHAINS)
+    again = {"solver": replace(SOLVER, tries=3), "record": 3}
+    whole, file = solved(**again), tmp_path / "run.ckpt"
+    sizes = [len(attempt.owners) for attempt in whole.recording.attempts]
+    assert sizes == [2 * CHAINS, 3 * CHAINS, 3 * CHAINS]
+    _, second, third = (whole.history["iteration"] <= began for began in whole.history["began"])
+    for count in (second.sum(), third.sum() - second.sum(), 1):  # in the second, third and third
+        with pytest.raises(Killed):
+            solved(**again, checkpoint=file, progress=killed_after(count))
+    assert_same(solved(**again, checkpoint=file), whole)
 
 
 stop_at_replay = []
@@ -425,7 +440,7 @@ def test_a_checkpoint_of_another_version_is_refused(written, tmp_path, monkeypat
     with pytest.raises(DraxError, match=r"version.mjx-drax .*, and this solve has .* 9.9"):
         solved(checkpoint=written)
     monkeypatch.setattr(checkpoint, "FORMAT", 9)
-    with pytest.raises(DraxError, match="is a checkpoint of format 4, and this version"):
+    with pytest.raises(DraxError, match="is a checkpoint of format 5, and this version"):
         solved(checkpoint=written)
 
 

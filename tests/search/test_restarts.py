@@ -33,6 +33,7 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
 from mjx_drax.problem.dynamics import FunctionDynamics
+from mjx_drax.search import restarts
 from mjx_drax.search.chains import Chains, best_of
 from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
@@ -50,6 +51,7 @@ def wells(x):
 
 
 PROGRAM = from_program(2, cost=wells, bounds=(-2.0, 2.0))
+RARE = from_program(2, cost=wells, bounds=([-1.2, -2.0], [2.0, 2.0]))  # a third start near it
 SHORT = replace(Restarts().flow, iterations=40, tail=20)
 
 
@@ -107,11 +109,51 @@ def test_beyond_enough_every_chain_is_tried_again():
 
 
 @pytest.mark.slow
+def test_chains_take_the_best_that_several_places_found():
+    one, four = (
+        minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=1, tries=tries))
+        for tries in (1, 4)
+    )
+    assert 0 < np.mean(one.cost > 2 * one.cost.min()) < 0.7  # so that a fourth of four is not
+    assert (four.cost < 2 * one.cost.min()).all()
+    assert four.cost.shape == four.history["cost"][0].shape == (16,)
+
+
+@pytest.mark.slow
+def test_where_most_places_disagree_one_more_attempt_looks_for_better_optima():
+    once, twice = (
+        search(Restarts(SHORT, tries=tries, attempts=attempts), 16, RARE)
+        for tries, attempts in ((4, 1), (4, 5))
+    )
+    assert (once.chains.cost < 2 * once.chains.cost.min()).all()  # all chains are done
+    assert [end > began for began, end in twice.began][:2] == [False, True]
+    agreed = search(Restarts(SHORT, tries=4), 16)
+    assert not any(end > began for began, end in agreed.began)
+
+
+@pytest.mark.slow
+def test_later_attempts_have_more_places_than_the_first(monkeypatch):
+    monkeypatch.setattr(restarts, "ROOM", 4)
+    rare = replace(SHORT, iterations=20)
+    found = solve(
+        swing(), chains=2, solver=Restarts(rare, attempts=2, done_share=2.0, tries=4), record=5
+    )
+    first, later = found.recording.attempts
+    assert [len(shot.cost) for shot in (*first.snapshots, later.snapshots[0])][-2:] == [4, 8]
+    for chain, cost in enumerate(found.cost):  # each has what it says that it got
+        assert found.recording.history_of(chain).cost[-1] == cost
+        np.testing.assert_array_equal(
+            found.recording.history_of(chain).x[-1], found.trajectories.x[chain]
+        )
+
+
+@pytest.mark.slow
 def test_what_an_attempt_leaves_early_is_polished_in_the_end():
     endless = Polish(tolerance=1e-12, iterations=60, patience=1)
-    found = search(Restarts(SHORT, attempts=2, done_share=1.0, polish=endless), chains=64)
-    _, (_, noise_ends), (finish, no_noise) = found.began
-    assert finish < noise_ends + endless.iterations  # the second attempt was left early
+    solver = Restarts(SHORT, descent=10, attempts=2, heated=False, done_share=1.0, polish=endless)
+    found = search(solver, chains=64)
+    _, (second, _), (finish, no_noise) = found.began
+    assert second < solver.descent + endless.iterations  # the first attempt was left early
     assert no_noise == finish
     polished = np.asarray(found.chains.state.polish.iterations)
     assert (polished >= endless.iterations - 2).all()  # the first and the last take no step
@@ -143,7 +185,7 @@ def test_a_solve_ends_after_the_seconds_that_it_is_given():
 def test_attempts_go_on_without_noise_where_it_brought_less_unless_all_are_asked_for():
     flow = replace(SHORT, iterations=200, noise=Constant(1e-6))  # it only takes longer
     for enough, noisy in ((1.0, 0), (2.0, 200)):
-        found = search(Restarts(flow, descent=5, attempts=4, done_share=enough), chains=64)
+        found = search(Restarts(flow, descent=5, attempts=4, done_share=enough), 64, RARE)
         first, second, third, *_ = [ends - began for began, ends in found.began]
         assert (first, second, third) == (0, 200, noisy)
 
@@ -486,16 +528,16 @@ TINY = replace(Restarts().flow, iterations=4, tail=4)
 
 @pytest.mark.slow
 def test_settings_that_depend_on_the_problem(balls):
-    smooth, kinked = (Restarts().for_problem(ball) for ball in balls)
+    smooth, kinked = (Restarts().for_problem(ball, 4) for ball in balls)
     assert (smooth.within, smooth.done_share, smooth.heated) == (0.1, 0.95, True)
     assert (kinked.within, kinked.done_share, kinked.heated) == (1.0, 0.9, None)
     assert (smooth.rollouts, kinked.rollouts) == (NO_ROLLOUTS, Rollouts())
     assert (smooth.polish, kinked.polish) == (Polish(1e-4), Polish(1e-4))
     sampled = replace(TINY, preconditioner=GaussNewton(derivatives=Smoothed()))
     for flow in (sampled, replace(TINY, preconditioner=Identity())):
-        assert Restarts(flow).for_problem(balls[0]).polish == Polish(iterations=0)
+        assert Restarts(flow).for_problem(balls[0], 4).polish == Polish(iterations=0)
     with jax.enable_x64(True):
-        assert Restarts().for_problem(bouncing(kinked=None)).polish == Polish(1e-8)
+        assert Restarts().for_problem(bouncing(kinked=None), 4).polish == Polish(1e-8)
     solver = Restarts(TINY, descent=4, attempts=2)
     found = solve(balls[1], chains=2, solver=solver).solver
     rest = {"rollouts": Rollouts(), "polish": Polish(1e-4)}

@@ -61,9 +61,9 @@ def test_a_path_begins_scattered_and_ends_at_the_answer(trapped: Solution) -> No
 
 
 def test_a_path_follows_the_best_try_of_each_attempt_up_to_the_answer() -> None:
-    first = Tries(np.arange(3), [_snapshot(0, [9, 9, 9], [5, 5, 5])])
+    first = Tries([_snapshot(0, [9, 9, 9], [5, 5, 5])], owners=np.arange(3))
     first.snapshots.append(_snapshot(10, [1.0, 5.0, 0.1], [1e-6, 1e-6, 0.5]))
-    second = Tries(np.array([1, 2, 2]), [_snapshot(10, [9, 9, 9], [5, 5, 5])])
+    second = Tries([_snapshot(10, [9, 9, 9], [5, 5, 5])], owners=np.array([1, 2, 2]))
     second.snapshots.append(_snapshot(20, [6.0, 4.0, 3.0], [1e-6, 1e-6, 1e-6]))
     attempts = Recording([first, second])
     assert list(attempts.history_of(0).iteration) == [0, 10]  # the second did not work for it
