@@ -102,8 +102,7 @@ class Found:
 
     Attributes:
         chains: the best of every chain, (N * chains,) rows.
-        records, began: as in `Stage`; `records` holds what every place in the batch was at, which
-            in later attempts are other tries of fewer chains.
+        records, began: as in `Stage`; in later attempts `records` holds other tries of fewer chains.
         flow: the settings of the first attempt, in the first problem's scales.
         compile_time, solve_time: [s].
     """

@@ -114,8 +114,8 @@ class Results:
         open_loop, feedback: the replays of every chain.
         tolerances: of violations of replays.
         history: `iteration` (records,), and `cost`, `max_defect`, `residual` (records, chains) of
-            every place in the batch, which in later attempts of `Restarts` hold tries for
-            unfinished chains; residuals are infinite before the polish, and NaN without one;
+            the best places in the batch at that moment, as many as there are chains, which in later
+            attempts of `Restarts` hold tries for unfinished chains; residuals are infinite before the polish, and NaN without one;
             `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
             its noise ended (the same, if it had none); the last polish of what attempts have left
             early counts as one.
