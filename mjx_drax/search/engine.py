@@ -102,7 +102,7 @@ class Found:
 
     Attributes:
         chains: the best of every chain, (N * chains,) rows.
-        records, began: as in `Stage`; in later attempts `records` holds other tries of fewer chains.
+        records, began: as in `Stage`; later attempts' records are of other tries for fewer chains.
         flow: the settings of the first attempt, in the first problem's scales.
         compile_time, solve_time: [s].
     """

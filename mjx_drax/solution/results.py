@@ -115,10 +115,10 @@ class Results:
         tolerances: of violations of replays.
         history: `iteration` (records,), and `cost`, `max_defect`, `residual` (records, chains) of
             the best places in the batch at that moment, as many as there are chains, which in later
-            attempts of `Restarts` hold tries for unfinished chains; residuals are infinite before the polish, and NaN without one;
-            `began` and `noise_ends` (attempts,): after how many iterations each attempt began, and
-            its noise ended (the same, if it had none); the last polish of what attempts have left
-            early counts as one.
+            attempts of `Restarts` hold tries for unfinished chains; residuals are infinite before
+            the polish, and NaN without one; `began` and `noise_ends` (attempts,): after how many
+            iterations each attempt began, and its noise ended (the same, if it had none); the last
+            polish of what attempts have left early counts as one.
         iterations: how many were done.
         compile_time, solve_time: [s].
         engine: what replayed.
