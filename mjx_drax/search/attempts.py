@@ -37,8 +37,8 @@ class AttemptSoFar:
         active: which places still move, (places,).
         cost, before: costs of places, now and when this was asked last, (places,).
         bar: up to which cost chains are done.
-        wanted: how many places must find what makes a chain done; before the first attempt as
-            `wanted` says, later as many as there are chains that were not done.
+        wanted: how many places must find what makes a chain done: in the first attempt as `wanted`
+            says, later as many as there are chains that are not done without it.
         needless: of them this many may fail to.
         iterations, since: of the attempt, and since this was asked last.
         wider: places of another attempt, for each of this one's.
@@ -69,18 +69,18 @@ class AttemptSoFar:
         return float(self.wanted - self.needless - places.sum())
 
     @property
-    def looks_on(self) -> bool:
-        """Whether the chains were done before, and the attempt only looks for better optima."""
+    def explores(self) -> bool:
+        """Whether enough chains are done without it, and it only looks for better optima."""
         return self.wanted <= self.needless
 
     @property
     def waited_for(self) -> np.ndarray:
         """Active places that matter, (places,).
 
-        If another attempt will be made, those that are not far too expensive, as these start again;
-        and if all chains are done.
+        Not those that are far too expensive, if they start again in another attempt, or need not be
+        done.
         """
-        some = self.looks_on or self.missing(self.hopeful) > 0.0
+        some = self.explores or self.missing(self.hopeful) > 0.0
         return self.active & self.hopeful if some else self.active
 
     @property
@@ -88,11 +88,11 @@ class AttemptSoFar:
         """Whether to end the attempt, where a finish will polish the places that are left.
 
         First case: enough chains are done, and there are more places than are wanted. (Else the
-        finish is the same as waiting.) Second case: another attempt is needed, and would
-        bring more chains than waiting. Of waiting one chain more is expected than came since this
-        was asked last (Laplace's rule of succession), so that a few chains do not decide by chance.
+        finish is the same as waiting.) Second case: another attempt is needed, and would bring more
+        than waiting. Of waiting one place more is expected than came since this was asked last
+        (Laplace's rule of succession), so that a few do not decide by chance.
         """
-        if self.looks_on:
+        if self.explores:
             return False
         if self.missing(self.near & ~self.active) <= 0.0:
             return len(self.active) > self.wanted
@@ -106,7 +106,7 @@ class AttemptSoFar:
 def wanted(chains: int, places: int) -> int:
     """How many places of the first attempt must find what makes a chain done.
 
-    One for each chain, and half of them: if all find different optima, there may be better ones.
+    As many as there are chains, and half of all: where most end elsewhere, better ones may be left.
     """
     return max(chains, places // 2)
 
