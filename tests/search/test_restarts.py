@@ -309,6 +309,7 @@ def test_a_langevin_is_one_attempt_as_it_stands():
             {"rollouts": Rollouts(iterations=30), "polish": Polish(iterations=20)},
             "than the 20 that",
         ),
+        ({"tries": 0}, "tries is 0: give a whole number of at least 1"),
         ({"polish": 1e-6}, r"polish is 1e-06: give Polish\(\) or None"),
         ({"polish": Polish(0.0)}, "polish.tolerance is 0.0"),
         ({"polish": Polish(iterations=-1)}, "polish.iterations is -1"),
@@ -526,6 +527,26 @@ def test_interrupted_between_rollouts_keeps_what_there_is(balls):
 TINY = replace(Restarts().flow, iterations=4, tail=4)
 
 
+def test_a_gpu_has_room_for_several_places_a_chain(monkeypatch):
+    assert settled(swing(), 64, 0, None).tries == 1  # on a CPU
+    monkeypatch.setattr(restarts, "on_gpu", lambda: True)
+    places = {}
+    for chains in (8, 64, 512, 1024, 2048, 16384):
+        settings = settled(swing(), chains, 0, None)
+        places[chains] = [settings.places(chains, attempt) for attempt in (0, 1, 4)]
+    assert places == {
+        8: [32, 32, 32],
+        64: [256, 256, 256],
+        512: [1024, 2048, 2048],
+        1024: [1024, 4096, 4096],
+        2048: [2048, 4096, 4096],
+        16384: [16384, 16384, 16384],
+    }
+    assert settled(bouncing(), 64, 0, None).tries == 1
+    assert settled(swing(), 64, 0, Restarts(tries=2)).places(64, 0) == 128
+    assert settled(swing(), 64, 0, Langevin()).tries == 1
+
+
 @pytest.mark.slow
 def test_settings_that_depend_on_the_problem(balls):
     smooth, kinked = (Restarts().for_problem(ball, 4) for ball in balls)
@@ -540,7 +561,7 @@ def test_settings_that_depend_on_the_problem(balls):
         assert Restarts().for_problem(bouncing(kinked=None), 4).polish == Polish(1e-8)
     solver = Restarts(TINY, descent=4, attempts=2)
     found = solve(balls[1], chains=2, solver=solver).solver
-    rest = {"rollouts": Rollouts(), "polish": Polish(1e-4)}
+    rest = {"rollouts": Rollouts(), "polish": Polish(1e-4), "tries": 1}
     assert found == replace(solver, within=1.0, done_share=0.9, **rest)
 
 
