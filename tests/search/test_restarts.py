@@ -584,6 +584,7 @@ def test_no_setting_of_the_users_is_replaced(balls):
         "heated": True,
         "rollouts": Rollouts(first=1, rounds=3, iterations=1),
         "polish": Polish(iterations=0),
+        "tries": 2,
     }
     for ball in balls:
         solver = Restarts(TINY, descent=5, attempts=2, **given)
