@@ -195,7 +195,7 @@ def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
 def first_of(
     of: np.ndarray, infeasible: np.ndarray, value: np.ndarray, missed: np.ndarray
 ) -> np.ndarray:
-    """Which row is the best `of` each chain, as `best_of` says; the earlier one of equals."""
+    """Which row is the best `of` each chain, as `Chains.order` ranks."""
     order = np.lexsort((value, missed, infeasible, of))
     return order[np.unique(of[order], return_index=True)[1]]
 

@@ -424,7 +424,8 @@ class Search:
         if not unfinished.any():
             return False
         done = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
-        now = kept if len(self._again) == self.chains else kept.at(self._again)
+        again = self._again
+        now = kept if len(again) == self.chains else kept.at(again)
         self.stage = replace(
             stage,
             finishing=stage.finishing + 1,
@@ -438,7 +439,7 @@ class Search:
         )
         if self.recorder is not None:
             self.recorder.begin(continues=True)
-            self.recorder.belong(self._again)
+            self.recorder.belong(again)
         self._record()
         return True
 
@@ -833,7 +834,7 @@ class Search:
         if len(rows):
             knots = replace(now.state.trajectory, slack=None)
             box = box_of_controls(*reversed(self.question), knots)
-            keys = np.stack([replayer.of[rows], rows % (len(now.missed) // self.width)], axis=1)
+            keys = np.stack([replayer.of[rows], rows % replayer.places], axis=1)
 
             def told(shots: Shots) -> None:
                 cost, worst = jnp.asarray(now.info.cost), jnp.asarray(now.info.max_defect)

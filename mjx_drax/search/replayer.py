@@ -48,9 +48,14 @@ class Replayer:
     diagnosed: Callable[[State], tuple[State, Info]]
 
     @property
+    def places(self) -> int:
+        """Rows of each problem."""
+        return len(self.floor) // len(self.indices)
+
+    @property
     def of(self) -> np.ndarray:
         """The problem of each row, (rows,)."""
-        return np.repeat(self.indices, len(self.floor) // len(self.indices))
+        return np.repeat(self.indices, self.places)
 
     def missed(self, chains: Chains) -> np.ndarray:
         """Which chains miss when they are replayed with feedback, (rows,); see `_tracked`."""

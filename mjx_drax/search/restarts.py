@@ -55,9 +55,9 @@ WITHIN, WITHIN_KINKED = 0.1, 1.0
 
 
 ROOM, MOST_PLACES, TRIES = 1024, 4096, 4
-"""Places that a GPU has room for: fewer are hardly faster. A first attempt has no more, unless each
-chain needs one. Four times as many take half the time that four attempts would; default tries make
-up to MOST_PLACES, and TRIES for each chain."""
+"""Places of the first attempt at most, if there are not more chains: on a GPU fewer are hardly
+faster. Places of later attempts, and for each chain, by default: four times as many places take
+half the time that four attempts would."""
 
 TOLERANCE = {4: 1e-4, 8: 1e-8}
 """Of the polish, by the bytes of a number."""
@@ -136,9 +136,9 @@ class Restarts:
             `Polish()` with the tolerance of the precision, unless derivatives are sampled or the
             metric is not `polished`, as `GaussNewton` is.
         tries: places for each chain in an attempt at a single problem without a guess; the best of
-            what they find is kept. The first attempt, which many problems do not go beyond, has
-            1,024 places or one for each chain. None: 4 on GPUs, or as many as make 4,096 places;
-            1 on CPUs, and where rollouts follow.
+            what they find is kept. The first attempt, which many problems do not go beyond, has at
+            most 1,024 places, or one for each chain. None: 4 on GPUs, or as many as make 4,096
+            places; 1 on CPUs, and where rollouts follow.
     """
 
     flow: Langevin = field(

@@ -114,7 +114,7 @@ def test_chains_take_the_best_that_several_places_found():
         minimize(PROGRAM, chains=16, solver=Restarts(SHORT, attempts=1, tries=tries))
         for tries in (1, 4)
     )
-    assert 0 < np.mean(one.cost > 2 * one.cost.min()) < 0.7  # so that a fourth of four is not
+    assert 0 < np.mean(one.cost > 2 * one.cost.min()) < 0.7  # over a fourth of the tries are good
     assert (four.cost < 2 * one.cost.min()).all()
     assert four.cost.shape == four.history["cost"][0].shape == (16,)
 
@@ -134,12 +134,11 @@ def test_where_most_places_disagree_one_more_attempt_looks_for_better_optima():
 @pytest.mark.slow
 def test_later_attempts_have_more_places_than_the_first(monkeypatch):
     monkeypatch.setattr(restarts, "ROOM", 4)
-    rare = replace(SHORT, iterations=20)
-    found = solve(
-        swing(), chains=2, solver=Restarts(rare, attempts=2, done_share=2.0, tries=4), record=5
-    )
+    solver = Restarts(replace(SHORT, iterations=20), attempts=2, done_share=2.0, tries=4)
+    found = solve(swing(), chains=2, solver=solver, record=5)
     first, later = found.recording.attempts
-    assert [len(shot.cost) for shot in (*first.snapshots, later.snapshots[0])][-2:] == [4, 8]
+    for attempt, places in ((first, 4), (later, 8)):
+        assert {len(shot.cost) for shot in attempt.snapshots} == {places}
     for chain, cost in enumerate(found.cost):  # each has what it says that it got
         assert found.recording.history_of(chain).cost[-1] == cost
         np.testing.assert_array_equal(
