@@ -34,6 +34,8 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
+from mjx_drax.kernels import kept  # noqa: E402
+
 # Again as configuration, in case a plugin of pytest imported jax before the lines above.
 for _option, _value in {
     "jax_compilation_cache_dir": os.environ["JAX_COMPILATION_CACHE_DIR"],
@@ -46,6 +48,19 @@ for _option, _value in {
 
 MAPS = Path("/proc/self/maps")
 """Of this process, a line each; Linux allows 65,530, and every compiled program takes some."""
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept(monkeypatch):
+    """Keep no programs: to write them pays off in a second process."""
+    monkeypatch.setattr(kept, "folder", lambda: None)
+
+
+@pytest.fixture
+def keeps_programs(monkeypatch, tmp_path, nothing_kept):
+    """Keep programs, in a folder of this test."""
+    monkeypatch.setattr(kept, "folder", lambda: tmp_path / "programs")
+    return tmp_path / "programs"
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -5,15 +5,18 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property, lru_cache, update_wrapper
+from inspect import Signature, signature
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_drax.base.errors import DraxError, reason
+from mjx_drax.kernels import kept
 
 OPTIONS: dict[str, dict[str, str | bool]] = {
     "gpu": {"xla_gpu_experimental_enable_fusion_autotuner": False},
@@ -33,6 +36,9 @@ too, so the host launches one of them, and not hundreds of kernels."""
 
 QUICKLY: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
 """For a CPU's program that runs once: it compiles faster, and runs slower."""
+
+_config: Any = jax.config
+"""Its attributes say what holds in a context, too; `values` only what was set for the process."""
 
 
 @contextmanager
@@ -144,24 +150,106 @@ class compiled:
 
     Nothing is looked up before the first call: asking for the backend is what starts it, and
     `jax.distributed.initialize` has to come first. With `graph` see `GRAPH`.
+
+    With a `key` the programs are kept on disk (see `kept`), and found there without tracing: for
+    the function's arguments, it gives a text that says what the function computes of numbers in
+    their place, the same in every process; None if that is not known. Then, and where arguments
+    lie on other devices than the first, JAX traces the function as ever.
     """
 
-    def __init__(self, function: Callable[..., Any], graph: bool = False, **settings: Any) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        graph: bool = False,
+        key: Callable[..., str | None] | None = None,
+        **settings: Any,
+    ) -> None:
         self._function, self._graph, self._settings = function, graph, settings
+        self._key = key
+        self._programs: dict[Any, Any] = {}
+        self._last: dict[Any, Any] = {}
         update_wrapper(self, function)
 
     @cached_property
-    def _jitted(self) -> Any:
+    def traced(self) -> Any:
+        """The function by `jax.jit`, whatever is kept: for several devices."""
         options = known_options(graph=True) if self._graph else known_options()
         return jax.jit(self._function, compiler_options=options, **self._settings)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
-        return self._jitted(*arguments, **named)
+        if self._key is None or kept.folder() is None or _config.jax_disable_jit:
+            return self.traced(*arguments, **named)
+        every = self._signature.bind(*arguments, **named).arguments
+        static = {name: every.pop(name) for name in self._static if name in every}
+        usual = self._last.get(tuple(static.items()))
+        if usual is not None:
+            with suppress(TypeError, ValueError):  # raised before it runs, for other arguments
+                return usual(**every)
+        program = self._program(every, static)
+        if program is None:
+            return self.traced(*arguments, **named)
+        self._last[tuple(static.items())] = program
+        return program(**every)
+
+    def _program(self, every: dict[str, Any], static: dict[str, Any]) -> Any | None:
+        """The program for these arguments; None if JAX is to trace the function."""
+        leaves, tree = jax.tree.flatten(every)
+        kinds = _kinds(leaves)
+        if kinds is None:
+            return None
+        known = tree, kinds, tuple(static.items()), jnp.result_type(float)
+        if known not in self._programs:
+            self._programs[known] = self._found(every, static, kinds)
+        return self._programs[known]
+
+    def _found(self, every: dict[str, Any], static: dict[str, Any], kinds: Any) -> Any | None:
+        """The program for these arguments from the disk, or compiled and kept there."""
+        assert self._key is not None
+        key = self._key(**every, **static)
+        if key is None:
+            return None
+        here = self._function.__module__, self._function.__qualname__, self._graph
+        key = repr((here, known_options(self._graph), static, kinds, key))
+        try:
+            program = kept.find(key, ((), every))
+        except kept.CannotBeKept:
+            return None
+        if program is None:
+            lowered = self.traced.lower(**every, **static)
+            with kept.unknown_to_jax():
+                program = lowered.compile()
+            kept.keep(key, program)
+        return program
+
+    @cached_property
+    def _signature(self) -> Signature:
+        return signature(self._function)
+
+    @property
+    def _static(self) -> tuple[str, ...]:
+        names = self._settings.get("static_argnames", ())
+        return (names,) if isinstance(names, str) else tuple(names)
 
     def lower(self, *arguments: Any, **named: Any) -> Any:
         """`jax.jit(...).lower`."""
-        return self._jitted.lower(*arguments, **named)
+        return self.traced.lower(*arguments, **named)
 
     def _cache_size(self) -> int:
-        return int(self._jitted._cache_size())
+        return int(self.traced._cache_size()) + sum(p is not None for p in self._programs.values())
+
+
+def _kinds(leaves: list[Any]) -> tuple[Any, ...] | None:
+    """Shapes and types of arguments; None if one of them is not on the first device."""
+    here = {jax.local_devices()[0]}
+    kinds: list[Any] = []
+    if _config.jax_default_device not in (None, *here):
+        return None
+    for leaf in leaves:
+        if isinstance(leaf, jax.Array):
+            if isinstance(leaf, jax.core.Tracer) or leaf.devices() != here:
+                return None
+            kinds.append(leaf.aval)
+        else:
+            kinds.append((type(leaf), getattr(leaf, "shape", None), getattr(leaf, "dtype", None)))
+    return tuple(kinds)

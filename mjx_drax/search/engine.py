@@ -609,7 +609,7 @@ class Search:
         shared, own = self.family.question(self.flow, scale, indices, self.chains, self.polish)
         # once: to send its dozens of numbers with every launch takes longer than an iteration
         self.question = jax.device_put(shared), own
-        program = partial(iterate, tail=settings.after > 0)
+        program = partial(iterate if self.mesh is None else iterate.traced, tail=settings.after > 0)
         self.launch = split_over(program, self.mesh, self.question[0])
 
     # Iterations

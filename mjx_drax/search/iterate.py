@@ -29,6 +29,7 @@ from mjx_drax.polish import interior_point
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import PARTS, Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.identity import identity
 from mjx_drax.search.scaled import without_units
 
 FEASIBLE = 1e-3
@@ -80,6 +81,13 @@ def joined(shared: Tree, own: Tree) -> Tree:
 def by_row(shared: Question, own: Question, function: Callable[..., Any], *rows: Any) -> Any:
     """function(question, *row) of every row."""
     return jax.vmap(lambda own, *row: function(joined(shared, own), *row))(own, *rows)
+
+
+def identity_of_rows(own: Any, shared: Any, **others: Any) -> str | None:
+    """`identity` of a program of questions, or problems, that `partition` parted."""
+    one: Any = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), own)
+    whole = joined(shared, one)
+    return identity((own, shared, others), getattr(whole, "problem", whole))
 
 
 @jax.jit
@@ -288,7 +296,11 @@ def iteration(i: Array, q: Question, state: State) -> State:
     return keep_finite(state, new, i, None)
 
 
-iterate = compiled(full_precision(loop), static_argnames=("tail", "noise", "diagnose"))
+iterate = compiled(
+    full_precision(loop),
+    key=lambda rows, shared, **others: identity_of_rows(rows[1], shared, state=rows[0]),
+    static_argnames=("tail", "noise", "diagnose"),
+)
 """`loop` as a program of its own."""
 
 
@@ -299,7 +311,7 @@ def evaluate(problem: Problem, trajectory: Trajectory) -> Info:
     return jax.vmap(lambda z: diagnosed(problem, z, problem.values(z)))(trajectory)
 
 
-@compiled
+@partial(compiled, key=identity_of_rows)
 @full_precision
 def feedback_gains(own: Question, shared: Question, states: State) -> Array:
     """Time-varying LQR gains (rows, K, nu, ndx) for a flow whose metric brings none."""

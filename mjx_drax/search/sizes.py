@@ -21,6 +21,7 @@ polished it counts in full: there the penalty alone holds the dynamics against t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -36,7 +37,7 @@ from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Knot, Trajectory
-from mjx_drax.search.iterate import Question, by_row, partition
+from mjx_drax.search.iterate import Question, by_row, identity_of_rows, partition
 
 SHARE = 1 / 300
 """The scale of costs, as a share of the median cost of the initial knots."""
@@ -67,7 +68,7 @@ class Sizes:
     effort: Array
 
 
-@compiled
+@partial(compiled, key=identity_of_rows)
 @linalg.full_precision
 def sizes_of(own: Question, shared: Question, knots: Trajectory) -> Sizes:
     """The sizes of every chain, (rows,), at knots (rows, K, ...)."""

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -36,7 +37,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
-from mjx_drax.search.iterate import joined
+from mjx_drax.search.iterate import identity_of_rows, joined
 from mjx_drax.solution.names import control_names, difference_names, state_names
 
 GOAL, TRACKING, DYNAMICS = "goal", "tracking", "dynamics"
@@ -304,7 +305,7 @@ def measured(
     )
 
 
-@compiled
+@partial(compiled, key=identity_of_rows)
 @full_precision
 def _measured(
     own: Problem,

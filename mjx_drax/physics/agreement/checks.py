@@ -23,7 +23,8 @@ from numpy.typing import ArrayLike
 from mjx_drax.base.digests import digest
 from mjx_drax.base.errors import DraxError, reason, shown
 from mjx_drax.base.numbers import vector
-from mjx_drax.kernels.compilation import run_once, said_plainly
+from mjx_drax.kernels.compilation import keep_programs, run_once, said_plainly
+from mjx_drax.kernels.kept import recall, remember
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.actuators import control_ranges, disabled
@@ -368,7 +369,7 @@ def examine(
 ) -> Findings:
     """Compare one step of MJX with one of the C engine, and look for the causes of an error.
 
-    What was found is remembered, since the step is compiled for it.
+    What was found is remembered, also on disk, since the step is compiled for it.
 
     Args:
         model: which is not changed.
@@ -384,7 +385,12 @@ def examine(
     asked = (name, x_init.tobytes(), contacts, bounded.tobytes(), kept, derivatives, binary(model))
     key = digest(repr(asked))
     if key not in _EXAMINED:
-        _EXAMINED[key] = _examined(model, name, x_init, contacts, bounded, kept, derivatives)
+        keep_programs()
+        found = recall(f"findings {key}")
+        if found is None:
+            found = _examined(model, name, x_init, contacts, bounded, kept, derivatives)
+            remember(f"findings {key}", found)
+        _EXAMINED[key] = found
     return _EXAMINED[key]
 
 

@@ -1,0 +1,169 @@
+"""Compiled programs on disk that a second process finds without tracing them.
+
+JAX's own cache is looked up by a digest of the traced program; for a robot, to trace takes most of
+a second start. Here the key is a text that says what a program computes, whatever else it is made
+of: who asks for one gives it, and everything that surrounds a program is added (`surroundings`).
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
+
+from mjx_drax.base.digests import DIGEST, digest, versions
+from mjx_drax.base.errors import DraxError
+from mjx_drax.base.files import complete
+
+ENABLED, FOLDER = "jax_enable_compilation_cache", "jax_compilation_cache_dir"
+"""JAX's settings of its own cache, which also say whether programs are kept here, and where."""
+
+_LOADED = time.time()
+_lock, _compiling = Lock(), [0]
+
+
+class CannotBeKept(Exception):
+    """JAX cannot write a program, but may find it in its own cache once it is traced."""
+
+
+def folder() -> Path | None:
+    """Where programs are kept, below the folder of JAX's cache; None if it has none on a disk."""
+    known = jax.config.values
+    if not (known[ENABLED] and known[FOLDER]) or "://" in known[FOLDER]:
+        return None
+    return Path(known[FOLDER]) / "programs"
+
+
+def recall(key: str) -> Any | None:
+    """What `remember` has written under the key on a machine like this one; None if nothing."""
+    where = _place(key)
+    try:
+        return where and pickle.loads(where.read_bytes())
+    except Exception:  # there is none, or not a whole one
+        return None
+
+
+def remember(key: str, value: Any) -> None:
+    """Write a value that follows from its key and `surroundings` alone, if it can be written."""
+    where = _place(key)
+    if where is None:
+        return
+    try:
+        content = pickle.dumps(value)
+        with complete(where) as path:
+            path.write_bytes(content)
+    except (DraxError, pickle.PicklingError, AttributeError, TypeError):
+        return  # no place, or a value of local classes
+
+
+def find(key: str, arguments: Any) -> Any | None:
+    """The program that was kept under the key, a `jax.stages.Compiled`; None if there is none.
+
+    Args:
+        key: what the program computes.
+        arguments: a tree with the structure of (), and the named arguments of a call.
+
+    Raises:
+        CannotBeKept: it was tried, and JAX could not write this program.
+    """
+    found = recall(key)
+    if found is None:
+        return None
+    result, content = found
+    if content is None:
+        raise CannotBeKept
+    trees = jax.tree.structure(arguments), jax.tree.structure(result)
+    try:
+        return serialize_executable.deserialize_and_load(
+            content, *trees, execution_devices=[jax.local_devices()[0]]
+        )
+    except Exception:  # of another machine after all: it is compiled again
+        return None
+
+
+def keep(key: str, program: Any) -> None:
+    """Write a program that was compiled `unknown_to_jax`, or that it cannot be written."""
+    try:
+        content, _, tree = serialize_executable.serialize(program)
+        result = jax.tree.unflatten(tree, range(tree.num_leaves))
+        pickle.dumps(result)
+    except Exception:  # JAX has several, as for callbacks into this process
+        result = content = None
+    remember(key, (result, content))
+
+
+@contextmanager
+def unknown_to_jax() -> Iterator[None]:
+    """Compile what is not kept twice, and is compiled anew.
+
+    On CPUs an executable from JAX's cache does not hold all that another process needs of it.
+    Threads that compile meanwhile do without that cache, too.
+    """
+    with _lock:
+        _compiling[0] += 1
+        if _compiling[0] == 1:
+            _use_cache(False)
+    try:
+        yield
+    finally:
+        with _lock:
+            _compiling[0] -= 1
+            if _compiling[0] == 0:
+                _use_cache(True)
+
+
+def _use_cache(used: bool) -> None:
+    jax.config.update(ENABLED, used)
+    compilation_cache.reset_cache()  # it asks once whether it is used
+
+
+def _place(key: str) -> Path | None:
+    """The file of a program; None if nothing is kept."""
+    below = folder()
+    if below is None or _machine() is None:
+        return None
+    return below / digest(key + surroundings()).removeprefix(DIGEST)
+
+
+def surroundings() -> str:
+    """What the same program depends on besides: versions, machine, settings of JAX and XLA."""
+    settings = {k: v for k, v in jax.config.values.items() if k not in (ENABLED, FOLDER)}
+    wide = jnp.result_type(float)  # a context may have changed what the settings say
+    return repr((_machine(), str(wide), os.environ.get("XLA_FLAGS"), sorted(settings.items())))
+
+
+@lru_cache
+def _machine() -> tuple[Any, ...] | None:
+    """Versions, this package's own code, and the processor that programs are compiled for.
+
+    None if the code was edited after it was loaded: its digest is not that of what runs.
+    """
+    files = sorted(Path(__file__).parents[1].rglob("*.py"))
+    if max(file.stat().st_mtime for file in files) > _LOADED:
+        return None
+    code = b"".join(file.read_bytes() for file in files)
+    device = jax.local_devices()[0]
+    processor = [platform.machine(), platform.processor(), os.cpu_count()]
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor.append(next((line for line in lines if line.startswith("flags")), None))
+    return (
+        sorted(versions().items()),
+        version("jaxlib"),
+        digest(code),
+        (device.platform, device.device_kind, device.client.platform_version),
+        processor,
+    )

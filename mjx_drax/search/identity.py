@@ -1,0 +1,95 @@
+"""What a program of rows computes, as a text, before it is traced; see `kernels.kept`.
+
+Of the functions that a user gave, the text is what JAX makes of them by themselves: each is traced
+once, for one knot, which takes a small part of the time that the whole program would. All else in a
+program is code of this package, what is static in its structures, and numbers that it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.tree_util import PyTreeDef
+
+from mjx_drax.base.digests import digest
+from mjx_drax.base.structures import Unspelled, spelled
+from mjx_drax.problem.problem import Problem
+
+
+def identity(arguments: Any, problem: Problem) -> str | None:
+    """What a program computes of arguments with this problem; None if that cannot be told.
+
+    Args:
+        arguments: a tree of all of them.
+        problem: with numbers of any row.
+    """
+    leaves, tree = jax.tree.flatten(problem)
+    kinds = tuple((jnp.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
+    try:
+        whole = spelled(jax.tree.structure(arguments), lambda kind: kind is Problem)
+        return whole + _of_functions(tree, kinds, jnp.result_type(float))
+    except Unspelled:
+        return None
+
+
+@lru_cache
+def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any) -> str:
+    """All functions of a problem, and f if it is made of functions, as programs of one knot."""
+    shapes = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
+    problem: Problem = jax.tree.unflatten(tree, shapes)
+    f = problem.dynamics
+    x, u = (jax.ShapeDtypeStruct((size,), problem.x_init.dtype) for size in (f.nx, f.nu))
+    try:
+        spelled(jax.tree.structure(f))
+        own_f = False
+    except Unspelled:
+        own_f = True
+
+    def functions(problem: Problem, x: Array, u: Array) -> Any:
+        knot = problem.knots.at(0)
+        return (
+            problem.running_cost(x, u, knot),
+            problem.terminal_cost(x),
+            problem.running_constraint(x, u, knot),
+            problem.end_constraint(x),
+            problem.dynamics.at(knot).step(x, u) if own_f else None,
+        )
+
+    def second(problem: Problem, x: Array, u: Array) -> Any:
+        """With all derivatives that a program may take: rules of a user's own count."""
+
+        def first(*at: Array) -> Any:
+            return jax.jvp(lambda *z: functions(problem, *z), at, tangents)
+
+        tangents = jnp.ones_like(x), jnp.ones_like(u)
+        return jax.jvp(first, (x, u), tangents)
+
+    traced = jax.jit(functions).trace(problem, x, u)
+    if any(name.startswith("custom") for name in _operations(traced.jaxpr.jaxpr)):
+        try:
+            traced = jax.jit(second).trace(problem, x, u)
+        except Exception as error:  # of several kinds, for rules of reverse mode
+            raise Unspelled(str(error)) from error
+    text = traced.lower().as_text()
+    if "callback" in text:
+        raise Unspelled("a callback to Python")
+    return digest(text) + digest(traced.jaxpr.consts)
+
+
+def _operations(jaxpr: Jaxpr) -> Iterator[str]:
+    """Names of all operations of a program, those inside of others included."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for part in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+            if _is_program(part):
+                yield from _operations(part.jaxpr if isinstance(part, ClosedJaxpr) else part)
+
+
+def _is_program(part: Any) -> bool:
+    return isinstance(part, Jaxpr | ClosedJaxpr)

@@ -1,0 +1,137 @@
+"""What a program computes is told apart by all that changes it, and by nothing else."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import arm, point, robot
+from jax.tree_util import Partial
+
+from mjx_drax import from_dynamics, register_dataclass, solve
+from mjx_drax.kernels.compilation import compiled
+from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.search import iterate, sizes
+from mjx_drax.search.identity import identity
+from mjx_drax.solution import violations
+
+TABLE = np.linspace(0.0, 1.0, 100_000, dtype=np.float32)
+
+
+def posed(push=0.1, weight=1.0, table=TABLE, bound=2.0, **changes):
+    """A point whose cost closes over an array and binds a number."""
+
+    def running(bound, x, u):
+        return bound * weight * jnp.sum(u**2) + jnp.asarray(table)[jnp.int32(x[0])]
+
+    rest = {"running_cost": Partial(running, bound), "f": lambda x, u: x + push * u}
+    return point(**rest | changes)
+
+
+def of(p):
+    return identity((p, 1.0), p)
+
+
+def test_what_computes_the_same_is_the_same():
+    assert of(posed()) is not None
+    assert of(posed()) == of(posed(bound=3.0))  # all else is made anew
+    assert of(posed()) == of(posed(x_init=[1.0, 1.0], name="another"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"push": 0.2},
+        {"weight": 1.1},
+        {"table": np.where(np.arange(len(TABLE)) == 70_000, 0.5, TABLE)},
+        {"horizon": 1.1},
+        {"terminal_residual": lambda x: x - 2.0},
+        {"equality": lambda x, u: u[0]},
+        {"inequality": lambda x, u: u[0] - 1.0},
+        {"terminal_equality": lambda x: x[0] - 1.0},
+        {"running_cost": lambda x, u: x[0] + u[0]},
+        {"running_residual": lambda x, u: u},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_what_computes_something_else_is_told_apart(change):
+    assert of(posed(**change)) is not None
+    assert of(posed(**change)) != of(posed())
+
+
+def test_models_are_told_apart_by_what_programs_know_of_them():
+    heavy, tilted = arm(joint='damping="1"'), arm(joint='damping="1" pos="0.1 0 0"')
+    assert of(robot(heavy)) is not None
+    assert of(robot(heavy)) == of(robot(heavy.replace('mass="1"', 'mass="2"')))  # a number
+    assert of(robot(heavy)) != of(robot(tilted))  # not 0 any more
+    assert of(robot(heavy)) != of(robot(heavy, running_cost=lambda d, u: d.qpos[0] ** 2))
+
+
+def test_rules_of_derivatives_count():
+    def ruled(slope):
+        @jax.custom_jvp
+        def square(x):
+            return x**2
+
+        square.defjvp(lambda p, t: (square(p[0]), slope * p[0] * t[0]))
+        return posed(running_cost=lambda x, u: square(u[0]) + x[0])
+
+    assert of(ruled(2.0)) is not None
+    assert of(ruled(2.0)) == of(ruled(2.0))
+    assert of(ruled(2.0)) != of(ruled(3.0))
+
+
+def test_what_cannot_be_told_has_no_identity():
+    @jax.custom_vjp
+    def square(x):
+        return x**2
+
+    square.defvjp(lambda x: (x**2, x), lambda x, g: (2 * x * g,))
+    assert of(posed(running_cost=lambda x, u: square(u[0]))) is None
+
+    def called_back(x, u):
+        return jax.pure_callback(lambda y: y, jax.ShapeDtypeStruct((), x.dtype), u[0])
+
+    assert of(posed(running_cost=called_back)) is None
+
+    @register_dataclass
+    @dataclass(frozen=True)
+    class Point(Dynamics):
+        dt: float = 0.1
+        nx, nu = 2, 1
+
+        def step(self, x, u):
+            return x + self.dt * jnp.array([x[1], u[0]])
+
+    own = from_dynamics(Point(), x_init=[0.0, 0.0], horizon=1.0, running_cost=lambda x, u: x @ x)
+    assert of(own) is None
+
+
+PROGRAMS = iterate.iterate, sizes.sizes_of, violations._measured
+
+
+@pytest.mark.parametrize("kind", ["function", "model"])
+def test_a_second_process_solves_alike_without_tracing(monkeypatch, keeps_programs, kind):
+    def anew():
+        return posed() if kind == "function" else robot(running_cost=lambda d, u: u[0] ** 2)
+
+    def forget():
+        for program in PROGRAMS:
+            program._programs.clear()
+            program._last.clear()
+
+    forget()
+    first = solve(anew(), chains=2, progress=False)
+    assert len(list(keeps_programs.iterdir())) >= len(PROGRAMS)
+    forget()
+
+    def traced(self):
+        raise AssertionError(f"{self.__name__} was traced")
+
+    monkeypatch.setattr(compiled, "traced", property(traced))
+    second = solve(anew(), chains=2, progress=False)
+    for a, b in zip(*(jax.tree.leaves(s.trajectories) for s in (first, second)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(first.feedback.cost, second.feedback.cost)
+    forget()
