@@ -7,6 +7,7 @@ program is code of this package, what is static in its structures, and numbers t
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
@@ -34,7 +35,7 @@ def identity(arguments: Any, problem: Problem) -> str | None:
     try:
         whole = spelled(jax.tree.structure(arguments), lambda kind: kind is Problem)
         return whole + _of_functions(tree, kinds, jnp.result_type(float))
-    except Unspelled:
+    except Exception:  # whatever it is, JAX says it better of the program itself
         return None
 
 
@@ -43,8 +44,7 @@ def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any
     """All functions of a problem, and f if it is made of functions, as programs of one knot."""
     shapes = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
     problem: Problem = jax.tree.unflatten(tree, shapes)
-    f = problem.dynamics
-    x, u = (jax.ShapeDtypeStruct((size,), problem.x_init.dtype) for size in (f.nx, f.nu))
+    f, number = problem.dynamics, problem.x_init.dtype
     try:
         spelled(jax.tree.structure(f))
         own_f = False
@@ -61,25 +61,29 @@ def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any
             problem.dynamics.at(knot).step(x, u) if own_f else None,
         )
 
-    def second(problem: Problem, x: Array, u: Array) -> Any:
-        """With all derivatives that a program may take: rules of a user's own count."""
+    def derived(problem: Problem, x: Array, u: Array) -> Any:
+        """Their second derivatives, for several knots at once."""
 
         def first(*at: Array) -> Any:
-            return jax.jvp(lambda *z: functions(problem, *z), at, tangents)
+            return jax.jvp(lambda *z: functions(problem, *z), at, at)
 
-        tangents = jnp.ones_like(x), jnp.ones_like(u)
-        return jax.jvp(first, (x, u), tangents)
+        return jax.vmap(lambda *at: jax.jvp(first, at, at))(x, u)
 
-    traced = jax.jit(functions).trace(problem, x, u)
+    def program(function: Any, *leading: int) -> Any:
+        sizes = ((*leading, n) for n in (f.nx, f.nu))
+        return jax.jit(function).trace(
+            problem, *(jax.ShapeDtypeStruct(size, number) for size in sizes)
+        )
+
+    traced = program(functions)
     if any(name.startswith("custom") for name in _operations(traced.jaxpr.jaxpr)):
-        try:
-            traced = jax.jit(second).trace(problem, x, u)
-        except Exception as error:  # of several kinds, for rules of reverse mode
-            raise Unspelled(str(error)) from error
-    text = traced.lower().as_text()
-    if "callback" in text:
+        traced = program(derived, 2)  # a user's own rules of derivatives and batches are in it
+    lowered = traced.lower().as_text()
+    if "callback" in lowered:
         raise Unspelled("a callback to Python")
-    return digest(text) + digest(traced.jaxpr.consts)
+    # Operations that derivatives alone know of, as stop_gradient, are not in what is lowered
+    text = re.sub(r" at 0x[0-9a-f]+", "", str(traced.jaxpr.jaxpr))
+    return "".join(map(digest, (text, lowered, traced.jaxpr.consts)))
 
 
 def _operations(jaxpr: Jaxpr) -> Iterator[str]:

@@ -82,6 +82,31 @@ def test_rules_of_derivatives_count():
     assert of(ruled(2.0)) != of(ruled(3.0))
 
 
+def test_what_derivatives_alone_know_of_counts():
+    stop = jax.lax.stop_gradient
+    costs = (
+        lambda x, u: u[0] * u[1],
+        lambda x, u: u[0] * stop(u[1]),
+        lambda x, u: stop(u[0]) * u[1],
+    )
+    found = {of(posed(running_cost=cost)) for cost in costs}
+    assert len(found - {None}) == 3
+
+
+def test_rules_of_batches_count():
+    def ruled(factor):
+        @jax.custom_batching.custom_vmap
+        def double(x):
+            return 2.0 * x
+
+        double.def_vmap(lambda size, batched, x: (factor * x, True))
+        return posed(running_cost=lambda x, u: double(u[0]))
+
+    assert of(ruled(2.0)) is not None
+    assert of(ruled(2.0)) == of(ruled(2.0))
+    assert of(ruled(2.0)) != of(ruled(3.0))
+
+
 def test_what_cannot_be_told_has_no_identity():
     @jax.custom_vjp
     def square(x):
