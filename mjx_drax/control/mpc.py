@@ -74,6 +74,7 @@ from mjx_drax.problem.trajectory import Knot
 from mjx_drax.search.chains import Chains
 from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.identity import identity
 from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
@@ -560,7 +561,13 @@ def _planner(structure: Any, explorers: int) -> compiled:
         )
         return after, packed(plan, packet.dtype)
 
-    return compiled(full_precision(plan), graph=True)
+    def key(leaves: list[Any], carried: Carried, packet: Array, data: Any) -> str | None:
+        shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf), leaf.dtype) for leaf in leaves]
+        settings = jax.tree.unflatten(structure, shapes)
+        known = identity((settings, carried, packet, data), settings[-1])
+        return known and f"{explorers} explore; {known}"
+
+    return compiled(full_precision(plan), graph=True, key=key)
 
 
 def _now_like(problem: Problem) -> Now:

@@ -206,6 +206,8 @@ class compiled:
     def _found(self, every: dict[str, Any], static: dict[str, Any], kinds: Any) -> Any | None:
         """The program for these arguments from the disk, or compiled and kept there."""
         assert self._key is not None
+        if self._graph and jax.default_backend() == "gpu":
+            return None  # nobody has measured whether a program from the disk still is a graph
         key = self._key(**every, **static)
         if key is None:
             return None

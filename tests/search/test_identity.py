@@ -9,7 +9,8 @@ import pytest
 from builders import arm, point, robot
 from jax.tree_util import Partial
 
-from mjx_drax import from_dynamics, register_dataclass, solve
+from mjx_drax import MPC, from_dynamics, register_dataclass, solve
+from mjx_drax.control.mpc import _planner
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.search import iterate, sizes
@@ -136,6 +137,10 @@ def test_what_cannot_be_told_has_no_identity():
 PROGRAMS = iterate.iterate, sizes.sizes_of, violations._measured
 
 
+def traced(program):
+    raise AssertionError(f"{program.__name__} was traced")
+
+
 @pytest.mark.parametrize("kind", ["function", "model"])
 def test_a_second_process_solves_alike_without_tracing(monkeypatch, keeps_programs, kind):
     def anew():
@@ -151,12 +156,22 @@ def test_a_second_process_solves_alike_without_tracing(monkeypatch, keeps_progra
     assert len(list(keeps_programs.iterdir())) >= len(PROGRAMS)
     forget()
 
-    def traced(self):
-        raise AssertionError(f"{self.__name__} was traced")
-
     monkeypatch.setattr(compiled, "traced", property(traced))
     second = solve(anew(), chains=2, progress=False)
     for a, b in zip(*(jax.tree.leaves(s.trajectories) for s in (first, second)), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(first.feedback.cost, second.feedback.cost)
     forget()
+
+
+@pytest.mark.slow
+def test_a_second_process_plans_alike_without_tracing(monkeypatch, keeps_programs):
+    def plan():
+        _planner.cache_clear()
+        policy = MPC(posed(running_cost=lambda x, u: u @ u), chains=2)
+        return policy.reset([0.0, 0.0]).u
+
+    first = plan()
+    monkeypatch.setattr(compiled, "traced", property(traced))
+    np.testing.assert_array_equal(first, plan())
+    _planner.cache_clear()
