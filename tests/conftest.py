@@ -50,14 +50,16 @@ MAPS = Path("/proc/self/maps")
 """Of this process, a line each; Linux allows 65,530, and every compiled program takes some."""
 
 
-@pytest.fixture(autouse=True)
-def nothing_kept(monkeypatch):
+@pytest.fixture(autouse=True, scope="session")
+def nothing_kept():
     """Keep no programs: to write them pays off in a second process."""
-    monkeypatch.setattr(kept, "folder", lambda: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept, "folder", lambda: None)
+        yield
 
 
 @pytest.fixture
-def keeps_programs(monkeypatch, tmp_path, nothing_kept):
+def keeps_programs(monkeypatch, tmp_path):
     """Keep programs, in a folder of this test."""
     monkeypatch.setattr(kept, "folder", lambda: tmp_path / "programs")
     return tmp_path / "programs"
