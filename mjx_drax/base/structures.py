@@ -6,9 +6,11 @@ its address.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -19,6 +21,7 @@ from mjx_drax.base.digests import digest
 
 _PLAIN = bool, int, float, complex, str, bytes, type(None)
 _KNOWN = "builtins", "mjx_drax", "jax", "jaxlib", "mujoco", "numpy"
+_HERE = Path(__file__).parents[1]
 
 
 class Unspelled(ValueError):
@@ -53,9 +56,21 @@ def _of_tree(tree: PyTreeDef, explained: Callable[[type], bool], free: bool) -> 
 def _of_class(kind: type) -> str:
     """Its name, if that is a class that always has this name."""
     name = f"{kind.__module__}.{kind.__qualname__}"
-    if kind.__module__.partition(".")[0] not in _KNOWN or "<" in name:
+    if kind is not type(None) and not _is_known(kind):
         raise Unspelled(name)
     return name
+
+
+def _is_known(kind: type) -> bool:
+    """Whether this package, or one whose version is asked for, has that class under its name."""
+    module = sys.modules.get(kind.__module__)
+    found: Any = module
+    for part in kind.__qualname__.split("."):
+        found = getattr(found, part, None)
+    root = kind.__module__.partition(".")[0]
+    if found is not kind or root not in _KNOWN:
+        return False
+    return root != "mjx_drax" or Path(str(module.__file__)).is_relative_to(_HERE)
 
 
 def _of(value: Any, free: bool) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_drax.base.errors import DraxError, reason
@@ -168,6 +167,7 @@ class compiled:
         self._key = key
         self._programs: dict[Any, Any] = {}
         self._last: dict[Any, Any] = {}
+        self._mark = jax.jit(lambda x: x) if key else None
         update_wrapper(self, function)
 
     @cached_property
@@ -178,27 +178,33 @@ class compiled:
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
-        if self._key is None or kept.folder() is None or _config.jax_disable_jit:
+        plain = _config.jax_disable_jit or _config.jax_debug_nans or _config.jax_debug_infs
+        if self._key is None or kept.folder() is None or plain:
             return self.traced(*arguments, **named)
+        if not self._mark._cache_size():  # so jax.clear_caches() has forgotten all programs
+            self._programs.clear()
+            self._last.clear()
+            self._mark(0)
         every = self._signature.bind(*arguments, **named).arguments
         static = {name: every.pop(name) for name in self._static if name in every}
-        usual = self._last.get(tuple(static.items()))
+        now = tuple(static.items()), *(getattr(_config, name) for name in _CONTEXT)
+        usual = self._last.get(now)
         if usual is not None:
             with suppress(TypeError, ValueError):  # raised before it runs, for other arguments
                 return usual(**every)
-        program = self._program(every, static)
+        program = self._program(every, static, now)
         if program is None:
             return self.traced(*arguments, **named)
-        self._last[tuple(static.items())] = program
+        self._last[now] = program
         return program(**every)
 
-    def _program(self, every: dict[str, Any], static: dict[str, Any]) -> Any | None:
-        """The program for these arguments; None if JAX is to trace the function."""
+    def _program(self, every: dict[str, Any], static: dict[str, Any], now: Any) -> Any | None:
+        """The program for these arguments in this context; None if JAX is to trace the function."""
         leaves, tree = jax.tree.flatten(every)
         kinds = _kinds(leaves)
         if kinds is None:
             return None
-        known = tree, kinds, tuple(static.items()), jnp.result_type(float)
+        known = tree, kinds, now
         if known not in self._programs:
             self._programs[known] = self._found(every, static, kinds)
         return self._programs[known]
@@ -239,6 +245,18 @@ class compiled:
 
     def _cache_size(self) -> int:
         return int(self.traced._cache_size()) + sum(p is not None for p in self._programs.values())
+
+
+_CONTEXT = (
+    "jax_enable_x64",
+    "jax_default_device",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+)
+"""Settings of JAX that a context may change, and that make another program."""
 
 
 def _kinds(leaves: list[Any]) -> tuple[Any, ...] | None:

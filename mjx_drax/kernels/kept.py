@@ -86,12 +86,23 @@ def find(key: str, arguments: Any) -> Any | None:
     if content is None:
         raise CannotBeKept
     trees = jax.tree.structure(arguments), jax.tree.structure(result)
+    _register_lapack()
     try:
         return serialize_executable.deserialize_and_load(
             content, *trees, execution_devices=[jax.local_devices()[0]]
         )
     except Exception:  # of another machine after all: it is compiled again
         return None
+
+
+@lru_cache
+def _register_lapack() -> None:
+    """Let XLA find the functions of LAPACK: JAX names them to it as it lowers one of them.
+
+    A program that is loaded and calls one that XLA does not know ends the process.
+    """
+    if jax.default_backend() == "cpu":
+        jax.jit(jnp.linalg.eigh).lower(jnp.eye(2))
 
 
 def keep(key: str, program: Any) -> None:
@@ -152,14 +163,15 @@ def _machine() -> tuple[Any, ...] | None:
     None if the code was edited after it was loaded: its digest is not that of what runs.
     """
     files = sorted(Path(__file__).parents[1].rglob("*.py"))
-    if max(file.stat().st_mtime for file in files) > _LOADED:
+    times = [time for file in files for time in (file.stat().st_mtime, file.stat().st_ctime)]
+    if max(times) > _LOADED:
         return None
     code = b"".join(file.read_bytes() for file in files)
     device = jax.local_devices()[0]
-    processor = [platform.machine(), platform.processor(), os.cpu_count()]
+    processor: list[Any] = [platform.machine(), platform.processor(), os.cpu_count()]
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        processor.append(next((line for line in lines if line.startswith("flags")), None))
+        processor += sorted({line for line in lines if line.startswith(("flags", "Features"))})
     return (
         sorted(versions().items()),
         version("jaxlib"),

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.extend.core import ClosedJaxpr, Jaxpr
-from jax.tree_util import PyTreeDef
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, primitives
 
 from mjx_drax.base.digests import digest
 from mjx_drax.base.structures import Unspelled, spelled
+from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.problem import Problem
+
+_JAXS = {p for p in vars(primitives).values() if isinstance(p, Primitive)}
+"""Operations whose rules are JAX's own."""
 
 
 def identity(arguments: Any, problem: Problem) -> str | None:
@@ -31,19 +34,24 @@ def identity(arguments: Any, problem: Problem) -> str | None:
         problem: with numbers of any row.
     """
     leaves, tree = jax.tree.flatten(problem)
-    kinds = tuple((jnp.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves)
     try:
         whole = spelled(jax.tree.structure(arguments), lambda kind: kind is Problem)
-        return whole + _of_functions(tree, kinds, jnp.result_type(float))
+        with full_precision:
+            return whole + _of_functions(jax.tree.unflatten(tree, map(_shape, leaves)))
     except Exception:  # whatever it is, JAX says it better of the program itself
         return None
 
 
-@lru_cache
-def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any) -> str:
-    """All functions of a problem, and f if it is made of functions, as programs of one knot."""
-    shapes = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
-    problem: Problem = jax.tree.unflatten(tree, shapes)
+def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
+    weak = getattr(leaf, "weak_type", isinstance(leaf, int | float))
+    return jax.ShapeDtypeStruct(jnp.shape(leaf), jax.dtypes.result_type(leaf), weak_type=weak)
+
+
+def _of_functions(problem: Problem) -> str:
+    """All functions of a problem, and f if it is made of functions, as programs of one knot.
+
+    They are traced each time: what they read of Python's objects may have changed.
+    """
     f, number = problem.dynamics, problem.x_init.dtype
     try:
         spelled(jax.tree.structure(f))
@@ -51,13 +59,17 @@ def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any
     except Unspelled:
         own_f = True
 
+    def anew(name: str, *arguments: Any) -> Any:
+        method = getattr(Problem, name).__wrapped__  # of those, JAX remembers what it has traced
+        return pruned(lambda *again: method(*again))(*arguments)
+
     def functions(problem: Problem, x: Array, u: Array) -> Any:
         knot = problem.knots.at(0)
         return (
-            problem.running_cost(x, u, knot),
-            problem.terminal_cost(x),
-            problem.running_constraint(x, u, knot),
-            problem.end_constraint(x),
+            anew("running_cost", problem, x, u, knot),
+            anew("terminal_cost", problem, x),
+            anew("running_constraint", problem, x, u, knot),
+            anew("end_constraint", problem, x),
             problem.dynamics.at(knot).step(x, u) if own_f else None,
         )
 
@@ -76,8 +88,11 @@ def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any
         )
 
     traced = program(functions)
-    if any(name.startswith("custom") for name in _operations(traced.jaxpr.jaxpr)):
+    used = set(_operations(traced.jaxpr.jaxpr))
+    if any(p.name.startswith("custom") or p not in _JAXS for p in used):
         traced = program(derived, 2)  # a user's own rules of derivatives and batches are in it
+    if any(p.name == "linear_call" for p in used):
+        raise Unspelled("a rule of transposition")
     lowered = traced.lower().as_text()
     if "callback" in lowered:
         raise Unspelled("a callback to Python")
@@ -86,10 +101,10 @@ def _of_functions(tree: PyTreeDef, kinds: tuple[tuple[Any, Any], ...], wide: Any
     return "".join(map(digest, (text, lowered, traced.jaxpr.consts)))
 
 
-def _operations(jaxpr: Jaxpr) -> Iterator[str]:
-    """Names of all operations of a program, those inside of others included."""
+def _operations(jaxpr: Jaxpr) -> Iterator[Primitive]:
+    """All operations of a program, those inside of others included."""
     for equation in jaxpr.eqns:
-        yield equation.primitive.name
+        yield equation.primitive
         for part in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
             if _is_program(part):
                 yield from _operations(part.jaxpr if isinstance(part, ClosedJaxpr) else part)

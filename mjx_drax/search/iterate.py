@@ -85,7 +85,7 @@ def by_row(shared: Question, own: Question, function: Callable[..., Any], *rows:
 
 def identity_of_rows(own: Any, shared: Any, **others: Any) -> str | None:
     """`identity` of a program of questions, or problems, that `partition` parted."""
-    one: Any = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), own)
+    one: Any = jax.tree.map(lambda a: jax.eval_shape(lambda rows: rows[0], a), own)
     whole = joined(shared, one)
     return identity((own, shared, others), getattr(whole, "problem", whole))
 

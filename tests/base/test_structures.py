@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
+from mjx_drax.base import structures
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.base.structures import Unspelled, spelled
+from mjx_drax.base.structures import _of_class as spelled_class
 from mjx_drax.problem.trajectory import Box
 
 TEXT = """
@@ -61,9 +63,12 @@ class Own:
     kind: object = field(metadata=Static)
 
 
-Own.__module__, Colour.__module__ = "mjx_drax.own", "mjx_drax.own"
+@pytest.fixture
+def classes_are_known(monkeypatch):
+    monkeypatch.setattr(structures, "_is_known", lambda kind: kind is not Users)
 
 
+@pytest.mark.usefixtures("classes_are_known")
 def test_static_parts_count():
     kinds = [1, 1.0, True, "1", b"1", None, (1,), (1, (2,)), Colour.RED, Colour.BLUE, Own, Box]
     kinds += [np.float32, np.float64(1), np.float32(1), (np.float32(2),)]
@@ -74,12 +79,27 @@ class Users:
     pass
 
 
+@pytest.mark.usefixtures("classes_are_known")
 @pytest.mark.parametrize("kind", [lambda: 0, Users(), Users, object()])
 def test_what_has_no_lasting_text_is_refused(kind):
     with pytest.raises(Unspelled):
         of(Own(0.0, kind))
 
 
+def test_a_class_is_known_by_what_its_module_has_under_its_name():
+    made = {}
+    exec("class int: pass\nclass Point: pass", made)
+    for kind in (*(made[name] for name in ("int", "Point")), Own):
+        assert kind is Own or kind.__module__ == "builtins"
+        with pytest.raises(Unspelled):
+            spelled_class(kind)
+    assert spelled_class(Box) == "mjx_drax.problem.trajectory.Box"
+    Own.__module__ = "mjx_drax.own"
+    with pytest.raises(Unspelled):
+        spelled_class(Own)
+
+
+@pytest.mark.usefixtures("classes_are_known")
 def test_functions_need_no_text_where_they_are_explained():
     function = Partial(lambda x, y: x, 1.0)
     with pytest.raises(Unspelled):

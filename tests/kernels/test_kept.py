@@ -1,7 +1,5 @@
 """Programs on disk are found without tracing, and only where they compute what is asked for."""
 
-import os
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,10 +86,10 @@ def test_the_code_of_this_package_surrounds_a_program(monkeypatch, tmp_path):
     here, code = machine(), tmp_path / "other.py"
     (tmp_path / "kernels").mkdir()
     monkeypatch.setattr(kept, "__file__", str(tmp_path / "kernels" / "kept.py"))
+    monkeypatch.setattr(kept, "_LOADED", np.inf)
     found = []
     for content in ("x = 1\n", "x = 2\n"):
         code.write_text(content)
-        os.utime(code, (0.0, 0.0))  # written before this process began
         found.append(machine())
     assert len({repr(m) for m in (here, *found)}) == 3
 
@@ -163,3 +161,27 @@ def test_jax_keeps_its_own_cache_for_all_else():
             assert not jax.config.values[kept.ENABLED]
         assert not jax.config.values[kept.ENABLED]
     assert jax.config.values[kept.ENABLED] == before
+
+
+def test_settings_that_a_context_changes_are_other_programs():
+    draw = compiled(
+        jax.random.normal, key=lambda key, **rest: "d", static_argnames=("shape", "dtype")
+    )
+    key, before = jax.random.key(0), jax.config.jax_threefry_partitionable
+    first = draw(key, shape=(3,))
+    try:
+        jax.config.update("jax_threefry_partitionable", not before)
+        np.testing.assert_array_equal(draw(key, shape=(3,)), jax.random.normal(key, (3,)))
+        assert (draw(key, shape=(3,)) != first).any()
+    finally:
+        jax.config.update("jax_threefry_partitionable", before)
+    np.testing.assert_array_equal(draw(key, shape=(3,)), first)
+
+
+def test_programs_are_forgotten_with_those_of_jax():
+    used = program()
+    used(X, 3)
+    assert used._cache_size() == 1
+    jax.clear_caches()
+    used({"x": jnp.arange(4.0)}, 3)
+    assert used._cache_size() == 1

@@ -1,5 +1,8 @@
 """What a program computes is told apart by all that changes it, and by nothing else."""
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 
 import jax
@@ -7,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import arm, point, robot
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jax.tree_util import Partial
 
 from mjx_drax import MPC, from_dynamics, register_dataclass, solve
@@ -94,6 +99,30 @@ def test_what_derivatives_alone_know_of_counts():
     assert len(found - {None}) == 3
 
 
+def test_rules_of_operations_that_are_not_jaxs_count():
+    def ruled(slope):
+        square = Primitive("square_of_a_user")
+        square.def_impl(lambda x: x**2)
+        square.def_abstract_eval(lambda x: x)
+        mlir.register_lowering(square, mlir.lower_fun(lambda x: x**2, multiple_results=False))
+        ad.defjvp(square, lambda t, x: slope * x * t)
+        batching.defvectorized(square)
+        return posed(running_cost=lambda x, u: square.bind(u[0]))
+
+    assert of(ruled(2.0)) is not None
+    assert of(ruled(2.0)) != of(ruled(3.0))
+
+
+def test_what_functions_read_is_looked_at_each_time():
+    target = [0.0]
+    problem = posed(running_cost=lambda x, u: (x[0] - target[0]) ** 2)
+    before = of(problem)
+    target[0] = 1.0
+    assert before != of(problem)
+    target[0] = 0.0
+    assert before == of(problem)
+
+
 def test_rules_of_batches_count():
     def ruled(factor):
         @jax.custom_batching.custom_vmap
@@ -175,3 +204,29 @@ def test_a_second_process_plans_alike_without_tracing(monkeypatch, keeps_program
     monkeypatch.setattr(compiled, "traced", property(traced))
     np.testing.assert_array_equal(first, plan())
     _planner.cache_clear()
+
+
+ALONE = """
+import jax.numpy as jnp
+from mjx_drax import from_function, solve
+from mjx_drax.search.iterate import iterate
+
+problem = from_function(
+    lambda x, u: x + 0.5 * u, x_init=[0.0], nu=1, horizon=1.0, dt=0.1,
+    running_cost=lambda x, u: jnp.sum((x - 1.0) ** 2) + 0.1 * jnp.sum(u**2),
+)
+solution = solve(problem, chains=2, progress=False)
+print(iterate.traced._cache_size(), solution.trajectories.x.tobytes().hex())
+"""
+
+
+def test_another_process_finds_a_program_that_calls_lapack(tmp_path):
+    known = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", ALONE], env=os.environ | known, capture_output=True, check=True
+        ).stdout
+        for _ in range(2)
+    )
+    assert len(list((tmp_path / "programs").iterdir())) >= len(PROGRAMS)
+    assert first == second
