@@ -63,8 +63,8 @@ def _of_class(kind: type) -> str:
 
 def _is_known(kind: type) -> bool:
     """Whether this package, or one whose version is asked for, has that class under its name."""
-    module = sys.modules.get(kind.__module__)
-    found: Any = module
+    module: Any = sys.modules.get(kind.__module__)
+    found = module
     for part in kind.__qualname__.split("."):
         found = getattr(found, part, None)
     root = kind.__module__.partition(".")[0]
