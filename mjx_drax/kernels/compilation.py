@@ -167,7 +167,7 @@ class compiled:
         self._key = key
         self._programs: dict[Any, Any] = {}
         self._last: dict[Any, Any] = {}
-        self._mark = jax.jit(lambda x: x)
+        self._mark: Any = jax.jit(lambda x: x) if key else None
         update_wrapper(self, function)
 
     @cached_property
