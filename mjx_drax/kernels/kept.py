@@ -163,8 +163,7 @@ def _machine() -> tuple[Any, ...] | None:
     None if the code was edited after it was loaded: its digest is not that of what runs.
     """
     files = sorted(Path(__file__).parents[1].rglob("*.py"))
-    times = [time for file in files for time in (file.stat().st_mtime, file.stat().st_ctime)]
-    if max(times) > _LOADED:
+    if max(max(stat.st_mtime, stat.st_ctime) for stat in map(Path.stat, files)) > _LOADED:
         return None
     code = b"".join(file.read_bytes() for file in files)
     device = jax.local_devices()[0]
