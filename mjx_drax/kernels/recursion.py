@@ -9,25 +9,15 @@ threads. Elsewhere an associative scan does the same in about 2 log2(K) rounds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mjx_drax.kernels import riccati_blocks, tiles
-from mjx_drax.kernels.batching import (
-    block_for_each_row,
-    merged_vmaps,
-    of_one_precision,
-    on_gpu,
-    repeated,
-    thread_for_each_row,
-)
+from mjx_drax.kernels import riccati_blocks, riccati_threads
+from mjx_drax.kernels.batching import merged_vmaps, of_one_precision, on_gpu, repeated
 from mjx_drax.kernels.linalg import product
-from mjx_drax.kernels.riccati_gpu import THREADS, Layout, over_stages, write
-from mjx_drax.kernels.small_matrices import Matrix, add, matmul
 
 MAX_ENTRIES = 64
 """Entries of F_k or of f_k that one thread keeps in its registers."""
@@ -63,9 +53,9 @@ def _all_chains(has_rows: Sequence[bool], *arguments: Array) -> Array:
     plain, kernel = jax.vmap(_one), None
     if on_gpu() and min(n, m) and of_one_precision((F, f)):
         if max(n * n, n * m) <= MAX_ENTRIES:
-            kernel = by_threads
+            kernel = riccati_threads.recursion
         elif n <= riccati_blocks.MAX_NDX and F.dtype == np.float32:
-            kernel = by_blocks
+            kernel = riccati_blocks.recursion
     if kernel is None:
         return plain(F, f)
     states: Array = lax.platform_dependent(F, f, cuda=kernel, default=plain)
@@ -74,41 +64,3 @@ def _all_chains(has_rows: Sequence[bool], *arguments: Array) -> Array:
 
 affine_recursion = merged_vmaps(_one, _all_chains)
 """x_1..x_K, (K, n, m), for F (K, n, n) and f (K, n, m)."""
-
-
-def by_threads(F: Array, f: Array, interpret: bool = False) -> Array:
-    """`affine_recursion` of many chains (chains, K, ...), a thread for each."""
-    chains, K, n, m = f.shape
-    given, found = Layout(F=(n, n), f=(n, m)), Layout(x=(n, m))
-
-    def body(given_ref: Any, found_ref: Any) -> None:
-        def stage(k: Array, here: dict[str, Any], x: Matrix) -> Matrix:
-            x = [add(*rows) for rows in zip(matmul(here["F"], x), here["f"], strict=True)]
-            write(found_ref, k, *x)
-            return x
-
-        zero = jnp.zeros_like(given_ref[0, 0, :])
-        over_stages(K, [given], [given_ref], stage, [[zero] * m for _ in range(n)])
-
-    packed = given.pack(F=F, f=f)
-    states = thread_for_each_row(body, THREADS, (K, found.size), [packed], interpret=interpret)
-    return found.unpack(states, "x")[:chains]
-
-
-def by_blocks(F: Array, f: Array, interpret: bool = False) -> Array:
-    """`affine_recursion` of many chains (chains, K, ...), a block of threads for each."""
-    chains, K, n, m = f.shape
-    N, M, multiply = tiles.tile(n), tiles.tile(m), tiles.products(interpret)
-
-    def body(F_ref: Any, f_ref: Any, x_ref: Any) -> None:
-        def stage(k: Array, x: Array) -> Array:
-            x = multiply(F_ref[0, k], x) + f_ref[0, k]
-            x_ref[0, k] = x
-            return x
-
-        lax.fori_loop(0, K, stage, jnp.zeros_like(f_ref[0, 0]))
-
-    arrays = tiles.padded(F, N, N), tiles.padded(f, N, M)
-    shapes: dict[str, tuple[int, ...]] = {"x": (chains, K, N, M)}
-    found = block_for_each_row(body, shapes, arrays, riccati_blocks.WARPS, interpret)
-    return found["x"][..., :n, :m]

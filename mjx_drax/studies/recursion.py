@@ -2,9 +2,10 @@
 
     python -m mjx_drax.studies.recursion [NDXxNU ...] [--chains N ...] [--knots K]
 
-A row for each size and number of chains: milliseconds of the plain recursion and of the kernel, and
-the largest difference of their Newton steps, relative to the largest entry. Times are medians of
-calls in one process. The problems are random: A = I + 0.1 N / sqrt(ndx), with N standard normal.
+A row for each size and number of chains: milliseconds of the plain recursion, of the kernels stage
+by stage and in segments, and the largest difference of the Newton steps, relative to the largest
+entry. Times are medians of calls in one process. The problems are random:
+A = I + 0.1 N / sqrt(ndx), with N standard normal.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.kernels.riccati_gpu import arrays_of, kernels_for
+from mjx_drax.kernels.riccati_segments import newton_steps, segments
 from mjx_drax.method.model import Linearization, QuadraticCost
 from mjx_drax.method.riccati import White, newton
 
@@ -64,21 +67,36 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sizes", nargs="*", default=SIZES, metavar="NDXxNU")
     parser.add_argument("--chains", type=int, nargs="+", default=[1, 32, 1024])
     parser.add_argument("--knots", type=int, default=60)
+    parser.add_argument("--segments", type=int, nargs="*", help="default: as solves choose")
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args(arguments)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {options.knots} knots\n")
-    print("| ndx, nu | chains | plain [ms] | kernel [ms] | apart |\n" + "|---" * 5 + "|")
+    print(
+        "| ndx, nu | chains | plain [ms] | by stages [ms] | segments | in segments [ms] | apart |"
+    )
+    print("|---" * 7 + "|")
     plain = jax.jit(full_precision(jax.vmap(newton.__wrapped__)))
-    kernel = jax.jit(full_precision(jax.vmap(newton)))
     for size in options.sizes:
         ndx, nu = map(int, size.split("x"))
         for chains in options.chains:
-            given = batch(chains, options.knots, ndx, nu)
-            before, wanted = timed(plain, given, options.repeats)
-            after, found = timed(kernel, given, options.repeats)
-            apart = float(jnp.max(jnp.abs(found.dx - wanted.dx)) / jnp.max(jnp.abs(wanted.dx)))
-            row = f"| {ndx}, {nu} | {chains:,} | {1e3 * before:.3f} | {1e3 * after:.3f}"
-            print(f"{row} | {apart:.0e} |", flush=True)
+            arguments = batch(chains, options.knots, ndx, nu)
+            given = arrays_of(arguments)
+            kernels = kernels_for(given)
+            before, wanted = timed(plain, arguments, options.repeats)
+            by_stages, found = timed(steps_in(kernels, 1), (given,), options.repeats)
+            row = f"| {ndx}, {nu} | {chains:,} | {1e3 * before:.3f} | {1e3 * by_stages:.3f}"
+            for count in options.segments or [segments(kernels, given)]:
+                cells = "- | -"
+                if count > 1:
+                    seconds, found = timed(steps_in(kernels, count), (given,), options.repeats)
+                    cells = f"{count} | {1e3 * seconds:.3f}"
+                apart = jnp.max(jnp.abs(found["dx"] - wanted.dx)) / jnp.max(jnp.abs(wanted.dx))
+                print(f"{row} | {cells} | {float(apart):.0e} |", flush=True)
+
+
+def steps_in(kernels: Any, count: int) -> Callable[..., Any]:
+    """The kernels' Newton steps in so many segments."""
+    return jax.jit(full_precision(lambda given: newton_steps(kernels, given, count)))
 
 
 if __name__ == "__main__":

@@ -4,14 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_drax.kernels.recursion import (
-    affine_recursion,
-    by_blocks,
-    by_threads,
-    in_parallel,
-    step_by_step,
-)
-from mjx_drax.kernels.riccati_gpu import THREADS
+from mjx_drax.kernels import riccati_blocks, riccati_threads
+from mjx_drax.kernels.recursion import affine_recursion, in_parallel, step_by_step
+from mjx_drax.kernels.riccati_threads import THREADS
 
 
 def example(K, n, m):
@@ -35,8 +30,8 @@ def test_it_is_the_loop(way, K, n, m):
 @pytest.mark.parametrize(
     ("kernel", "chains", "n", "m"),
     [
-        (by_threads, THREADS + 3, 2, 3),
-        (by_blocks, 2, 17, 3),
+        (riccati_threads.recursion, THREADS + 3, 2, 3),
+        (riccati_blocks.recursion, 2, 17, 3),
     ],
 )
 def test_kernels_agree_with_the_loop(kernel, chains, n, m):

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax.kernels import riccati_blocks, riccati_gpu
-from mjx_drax.kernels.riccati_gpu import MAX_NDX, THREADS, arrays_of, newton_steps
+from mjx_drax.kernels import riccati_blocks, riccati_gpu, riccati_threads
+from mjx_drax.kernels.riccati_gpu import arrays_of, kernels_for
+from mjx_drax.kernels.riccati_segments import newton_steps, segments
+from mjx_drax.kernels.riccati_threads import MAX_NDX, THREADS, Given
 from mjx_drax.method.model import Linearization, QuadraticCost
 from mjx_drax.method.riccati import White, newton
 
@@ -16,7 +18,7 @@ K, NDX, NU = 3, 3, 2
 JAX = tuple(map(int, jax.__version__.split(".")[:2]))
 
 
-def batch(chains, dtype, noisy=True, ndx=NDX, soft=True):
+def batch(chains, dtype, noisy=True, ndx=NDX, soft=True, K=K):
     """A different problem for every chain, penalties included; none if not `soft`."""
     rng = np.random.default_rng(0)
     n = ndx + NU
@@ -58,7 +60,8 @@ def test_it_agrees_with_the_plain_recursion(noisy, soft):
     with jax.enable_x64(True):
         arguments = batch(THREADS + 5, np.float64, noisy, soft=soft)  # two warps, one not full
         plain = jax.jit(jax.vmap(newton))(*arguments)
-        agree(newton_steps(*arrays_of(arguments), interpret=True), plain, 1e-9)
+        seen = newton_steps(riccati_threads, arrays_of(arguments), interpret=True)
+        agree(seen, plain, 1e-9)
 
 
 @pytest.mark.parametrize(("noisy", "soft", "penalty"), [(*k, None) for k in KINDS] + [INFINITE])
@@ -68,26 +71,62 @@ def test_blocks_agree_with_the_plain_recursion(noisy, soft, penalty):
         if penalty:
             arguments = (*arguments[:3], jnp.full(2, penalty), arguments[-1])
         plain = jax.jit(jax.vmap(newton))(*arguments)
-        seen = riccati_blocks.newton_steps(*arrays_of(arguments), interpret=True)
+        seen = newton_steps(riccati_blocks, arrays_of(arguments), interpret=True)
         agree(seen, plain, 1e-9)
+
+
+@pytest.mark.parametrize(("kernels", "ndx"), [(riccati_threads, NDX), (riccati_blocks, 17)])
+@pytest.mark.parametrize("noisy", [True, False])
+def test_in_segments_they_agree_with_the_plain_recursion(kernels, ndx, noisy):
+    """Seven stages in three segments, of which the last is filled up; penalties up to 1e4."""
+    with jax.enable_x64(True):
+        arguments = batch(2, np.float64, noisy, ndx=ndx, K=7)
+        plain = jax.jit(jax.vmap(newton))(*arguments)
+        seen = newton_steps(kernels, arrays_of(arguments), 3, interpret=True)
+        agree(seen, plain, 1e-9)
+
+
+@pytest.mark.parametrize("kernels", [riccati_threads, riccati_blocks])
+def test_in_segments_what_no_control_moves_is_no_trouble(kernels):
+    """C is singular to rounding where a penalty is large and controls move one state of three."""
+    linear, cost, multipliers, _, white = batch(2, np.float32, K=8)
+    linear = replace(linear, A=0.5 * linear.A, B=linear.B.at[:, :, 1:].set(0.0))
+    arguments = linear, cost, multipliers, jnp.full(2, 1e8, np.float32), white
+    plain = jax.jit(jax.vmap(newton))(*arguments)
+    seen = newton_steps(kernels, arrays_of(arguments), 4, interpret=True)
+    agree(seen, plain, 1e-3)
+
+
+def test_segments_are_for_few_chains_and_many_stages():
+    def count(kernels, chains, K, ndx, penalty=True):
+        h = np.zeros((chains, K, ndx))
+        return segments(kernels, Given(*[h] * 9, penalty=h[:, 0, 0] if penalty else None))
+
+    assert count(riccati_blocks, 1, 60, 36) == 11
+    assert count(riccati_blocks, 32, 60, 36) == 8
+    assert count(riccati_threads, 1, 1000, 4) == 45
+    assert count(riccati_blocks, 100, 60, 36) == count(riccati_blocks, 1, 20, 36) == 1
+    assert count(riccati_threads, 1, 100, 4) == count(riccati_threads, 1, 1000, 6) == 1
+    assert count(riccati_blocks, 1, 60, 36, penalty=False) == 1  # as in the polish
 
 
 def test_blocks_that_are_not_positive_definite_are_not_numbers():
     """The polish sees from it that the model needs more damping."""
     linear, cost, *rest = batch(2, np.float32, noisy=False)
     cost = replace(cost, Huu=cost.Huu.at[1].add(-1e4 * jnp.eye(NU)))
-    arrays = arrays_of((linear, cost, *rest))
-    seen = riccati_blocks.newton_steps(*arrays, interpret=True)
+    given = arrays_of((linear, cost, *rest))
+    seen = newton_steps(riccati_blocks, given, interpret=True)
     assert [bool(jnp.isfinite(dx).all()) for dx in seen["dx"]] == [True, False]
 
 
 def test_a_kernel_is_chosen_by_the_size_of_blocks():
-    def kernel(ndx, nu, dtype=np.float32):
-        return riccati_gpu.kernel_for(np.zeros((ndx, ndx), dtype), np.zeros((ndx, nu), dtype))
+    def kernels(ndx, nu, dtype=np.float32):
+        A, B = np.zeros((ndx, ndx), dtype), np.zeros((ndx, nu), dtype)
+        return kernels_for(Given(A, B, *[A] * 7))
 
-    assert kernel(6, 4) is kernel(6, 4, np.float64) is newton_steps
-    assert kernel(7, 4) is kernel(64, 32) is riccati_blocks.newton_steps
-    assert kernel(7, 4, np.float64) is kernel(65, 4) is kernel(8, 0) is None
+    assert kernels(6, 4) is kernels(6, 4, np.float64) is riccati_threads
+    assert kernels(7, 4) is kernels(64, 32) is riccati_blocks
+    assert kernels(7, 4, np.float64) is kernels(65, 4) is kernels(8, 0) is None
 
 
 @pytest.mark.slow
@@ -98,9 +137,9 @@ def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeyp
     plain = jax.jit(jax.vmap(newton))(*arguments)
     calls = []
 
-    def interpreted(*arrays):
-        calls.append(len(arrays[0]))
-        return newton_steps(*arrays, interpret=True)
+    def interpreted(kernels, given, count):
+        calls.append(len(given.A))
+        return newton_steps(kernels, given, count, interpret=True)
 
     def as_on_gpus(*arguments, default, **own):
         return own.get("cuda", default)(*arguments)
@@ -120,9 +159,11 @@ def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeyp
     JAX >= (0, 11),
     reason="since jax 0.11, Triton kernels are lowered only where there is a GPU",
 )
-@pytest.mark.parametrize("steps", [newton_steps, riccati_blocks.newton_steps])
+@pytest.mark.parametrize("kernels", [riccati_threads, riccati_blocks])
 @pytest.mark.parametrize("noisy", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_it_lowers_for_cuda_without_a_gpu(noisy, steps):
-    arrays = arrays_of(batch(4, np.float32, noisy))
-    text = jax.jit(steps).trace(*arrays).lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("triton") >= 2
+def test_it_lowers_for_cuda_without_a_gpu(noisy, kernels):
+    given = arrays_of(batch(4, np.float32, noisy))
+    for count, launches in ((1, 2), (2, 6)):
+        steps = jax.jit(lambda given, count=count: newton_steps(kernels, given, count))
+        text = steps.trace(given).lower(lowering_platforms=("cuda",)).as_text()
+        assert text.count("triton") >= launches
