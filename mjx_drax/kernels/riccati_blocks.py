@@ -91,7 +91,7 @@ def followed(
     N, M = tile(n), tile(m)
     zero = jnp.zeros((rows, n), given.h.dtype)
     dx, nx = start or (zero, zero)
-    arrays = [
+    arrays: list[Array] = [
         *(padded(a, N) for a in (dx, nx)),
         padded(given.A, N, N),
         padded(given.B, N, M),
@@ -100,21 +100,22 @@ def followed(
     ]
     soft = given.penalty is not None
     if given.penalty is not None:
+        assert factors.T is not None
         arrays += [factors.T, (1.0 / given.penalty)[:, None]]
-    shapes = {"dx": (N,), "du": (M,), "rate": (N,)}
-    noisy = given.xi_u is not None
-    if noisy:
-        of_u, of_x = _colored(given, factors)
+    shapes: dict[str, tuple[int, ...]] = {"dx": (N,), "du": (M,), "rate": (N,)}
+    noisy = given.xi_u is not None and given.xi_e is not None
+    if given.xi_u is not None and given.xi_e is not None:
+        of_u, of_x = _colored(given, factors, given.xi_u, given.xi_e)
         arrays += [padded(of_u, M), padded(of_x, N)]
         shapes |= {"noise_x": (N,), "noise_u": (M,)}
-    full = {name: (rows, K, *shape) for name, shape in shapes.items()}
+    full: dict[str, tuple[int, ...]] = {name: (rows, K, *s) for name, s in shapes.items()}
     step = block_for_each_row(partial(forward, K, soft, noisy), full, arrays, WARPS, interpret)
     sizes = {"du": m, "noise_u": m}
     found = {name: a[..., : sizes.get(name, n)] for name, a in step.items()}
     return {"noise_x": None, "noise_u": None, **found, "gains": factors.K[..., :m, :n]}
 
 
-def _colored(given: Given, factors: Factors) -> tuple[Array, Array]:
+def _colored(given: Given, factors: Factors, xi_u: Array, xi_e: Array) -> tuple[Array, Array]:
     """The noise of controls and of defects, from white numbers."""
     n, m = given.B.shape[2:]
 
@@ -126,7 +127,7 @@ def _colored(given: Given, factors: Factors) -> tuple[Array, Array]:
     over_stages = jax.vmap(colored, in_axes=(None, 0, 0, 0, 0))
     none = jnp.zeros(len(given.h), given.h.dtype)
     soft = none if given.penalty is None else 1.0 / given.penalty
-    of_u, of_x = jax.vmap(over_stages)(soft, factors.Quu, factors.P, given.xi_u, given.xi_e)
+    of_u, of_x = jax.vmap(over_stages)(soft, factors.Quu, factors.P, xi_u, xi_e)
     return of_u, of_x
 
 

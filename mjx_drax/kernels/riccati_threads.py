@@ -145,8 +145,8 @@ def followed(
     out = Layout(dx=(n,), du=(m,), **noise, rate=(n,))
     layouts, arrays = zip(*stages, strict=True)
     program = partial(forward, K, first, layouts)
-    shape, arrays = (K, out.size), [first.pack(**parts), *arrays]
-    steps = thread_for_each_row(program, THREADS, shape, arrays, interpret=interpret)
+    given_to = [first.pack(**parts), *arrays]
+    steps = thread_for_each_row(program, THREADS, (K, out.size), given_to, interpret=interpret)
     step = {name: out.unpack(steps, name)[:rows] for name in out.shapes}
     gains = left.unpack(factors, "K")[:rows]
     return {"noise_x": None, "noise_u": None, **step, "gains": gains}
@@ -222,7 +222,8 @@ class Stage(NamedTuple):
 
 def before(s: dict[str, Any], soft: Array | None, P: Matrix, p: Vector) -> Stage:
     """`method.riccati.factorize` of one stage."""
-    P_relaxed, p_relaxed, Ls = P, p, []
+    Ls: Matrix = []
+    P_relaxed, p_relaxed = P, p
     if soft is not None:
         n = range(len(p))
         Ls = factor([[soft * P[r][c] + (1.0 if r == c else 0.0) for c in n] for r in n])

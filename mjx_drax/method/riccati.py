@@ -26,7 +26,7 @@ affine recursion
 
 that GPUs solve in parallel over time. Shapes: all arrays carry the stage axis K first.
 
-Many chains on a GPU are done by kernels, stage by stage (`kernels.riccati_gpu`, `riccati_blocks`).
+On GPUs kernels do it (`kernels.riccati_gpu`), for few chains in segments (`riccati_segments`).
 """
 
 from __future__ import annotations

@@ -98,6 +98,10 @@ class Values:
         return jnp.sum(self.costs[:-1]) + self.costs[-1]
 
 
+APART = 4e-5
+"""Share of its size by which a number that bounds leave no choice of may move in a plan."""
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Box:
@@ -114,7 +118,10 @@ class Box:
     start_upper: Array | None = None
 
     def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
-        """The lower and the upper end for every knot of a trajectory, as two trajectories."""
+        """The lower and the upper end for every knot of a trajectory, as two trajectories.
+
+        Equal ends are moved apart by `APART`, as knots need an interior to move in.
+        """
         x, u = trajectory.x, trajectory.u
         zeros = jax.tree.map(jnp.zeros_like, trajectory.slack)
         infinite = jax.tree.map(lambda s: jnp.full_like(s, jnp.inf), trajectory.slack)
@@ -126,8 +133,9 @@ class Box:
             whole = jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape)
             return Trajectory(*whole, of_slack, start)
 
-        lower = side(self.x_lower, self.u_lower, zeros, self.start_lower)
-        upper = side(self.x_upper, self.u_upper, infinite, self.start_upper)
+        x_ends, u_ends = _apart(self.x_lower, self.x_upper), _apart(self.u_lower, self.u_upper)
+        lower = side(x_ends[0], u_ends[0], zeros, self.start_lower)
+        upper = side(x_ends[1], u_ends[1], infinite, self.start_upper)
         return lower, upper
 
     def violation(self, trajectory: Trajectory) -> Array:
@@ -141,6 +149,16 @@ class Box:
         )
         largest = jnp.maximum(out.x, out.u)
         return largest if out.start is None else jnp.maximum(largest, out.start)
+
+
+def _apart(lower: Array, upper: Array) -> tuple[Array, Array]:
+    """The ends, `APART` where they are equal: of their own size, else the coordinate's, else 1."""
+    ends = jnp.stack(jnp.broadcast_arrays(jnp.atleast_2d(lower), jnp.atleast_2d(upper)))
+    sizes = jnp.where(jnp.isfinite(ends), jnp.abs(ends), 0.0).max(axis=(0, 1), initial=0.0)
+    of_coordinate = jnp.where(sizes > 0.0, sizes, 1.0)
+    own = jnp.where(lower == 0.0, of_coordinate, jnp.abs(lower))
+    half = jnp.where(lower == upper, 0.5 * APART * own, 0.0)
+    return lower - half, upper + half
 
 
 def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:

@@ -29,7 +29,7 @@ class Chains:
     Attributes:
         state, info: of every row.
         feasible_since: since which iteration each was feasible, or -1, (rows,).
-        missed: whether it was replayed, and did not come to where it should, (rows,).
+        missed: whether its replay, or its plan, did not come to where it should, (rows,).
     """
 
     state: State
@@ -54,7 +54,7 @@ class Chains:
 
     @property
     def sound(self) -> np.ndarray:
-        """Feasible, and not known to be missed by their replay, (rows,)."""
+        """Feasible, and not known to miss, (rows,)."""
         return self.feasible & ~self.missed
 
     @property
@@ -94,6 +94,8 @@ class Stage:
         place: how many of them are done; the chunk is what follows.
         begun: whether `now` belongs to this chunk; else it has not begun.
         kept: the best so far of all chains of all problems, (N * chains,); None before any.
+        least: the least cost of feasible plans from its floor, those included that miss the goal,
+            (N,); infinite where plans are not asked. Noise of attempts has its scale.
         now: where the chunk's chains are, (rows,).
         before: `now.sound_cost` when it was asked last whether to wait, (rows,).
         damping: of each row between rollouts, (rows,); inf for rows that they cannot improve.
@@ -117,6 +119,7 @@ class Stage:
     place: int
     begun: bool
     kept: Chains | None
+    least: np.ndarray
     now: Chains
     before: np.ndarray
     damping: np.ndarray

@@ -255,6 +255,7 @@ class Search:
             place=0,
             begun=True,
             kept=kept,
+            least=np.full(family.count, np.inf),
             now=now,
             before=now.sound_cost,
             damping=np.ones(rows),
@@ -592,8 +593,10 @@ class Search:
             assert kept is not None
             shape = self.family.count, self.chains
             costs = kept.cost.reshape(shape) - self.stage.floor[:, None]
-            feasible = kept.feasible.reshape(shape)[indices]
-            noise = np.sqrt(temperature(costs[indices], feasible, cost))
+            feasible, least = kept.feasible.reshape(shape), self.stage.least[:, None]
+            costs = np.concatenate([costs, least], axis=1)[indices]
+            feasible = np.concatenate([feasible, np.isfinite(least)], axis=1)[indices]
+            noise = np.sqrt(temperature(costs, feasible, cost))
             noise *= COOLER**self.stage.coolings
         elif attempt == 0 or not settings.heated:
             flow = replace(flow, iterations=settings.descent)
@@ -776,10 +779,20 @@ class Search:
         return Replayer(self.family, indices, self.question, floor, diagnosed)
 
     def _roll_out(self) -> bool:
-        """The rollouts that follow an attempt; False if they are interrupted. See `Rollouts`."""
+        """The rollouts that follow an attempt; False if they are interrupted. See `Rollouts`.
+
+        Without any, plans of a single problem tell which chains miss the goal. In a batch most
+        problems may have goals out of reach, and would be tried again for nothing.
+        """
         rollouts, stage = self.settings.rollouts, self.stage
         assert rollouts is not None
         if not rollouts.asked:
+            if self.family.alone and self.family.problem.goal is not None:
+                now = self._whole(stage.now)
+                now = replace(now, missed=self._replayer.short(now))
+                costs = np.where(now.feasible, now.cost, np.inf) - stage.floor[0]
+                least = np.minimum(stage.least, costs.min())
+                self.stage = replace(stage, now=replace(stage.now, missed=now.missed), least=least)
             return True
         now = self._whole(stage.now)
         better = np.zeros(len(now.missed), bool)

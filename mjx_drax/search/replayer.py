@@ -28,6 +28,9 @@ from mjx_drax.search.shooting import Shots
 SHARES = (0.5, 0.2, 0.05)
 """Of what a round has changed, these are rolled out where all of it brings no improvement."""
 
+ALIKE = 1e-4
+"""Plans that end within this share of the largest entries end alike."""
+
 
 @dataclass(frozen=True)
 class Replayer:
@@ -60,6 +63,20 @@ class Replayer:
     def missed(self, chains: Chains) -> np.ndarray:
         """Which chains miss when they are replayed with feedback, (rows,); see `_tracked`."""
         return self._rolled_out(chains, 1.0)[1]
+
+    def short(self, chains: Chains) -> np.ndarray:
+        """Which feasible chains have plans that end short of the goal, (rows,).
+
+        A goal takes microseconds in Python, so plans that end alike are asked once.
+        """
+        missed, rows = np.zeros(len(chains.missed), bool), np.flatnonzero(chains.feasible)
+        if len(rows):
+            plans = self._plans(chains.state.trajectory)[rows]
+            size = np.maximum(np.abs(plans[:, -1]).max(axis=0), np.finfo(float).tiny)
+            coarse = np.round(plans[:, -1] / (ALIKE * size))
+            _, first, which = np.unique(coarse, axis=0, return_index=True, return_inverse=True)
+            missed[rows] = ~self.family.reached(plans[first])[which.ravel()]
+        return missed
 
     def rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
         """The best of chains and of their rollouts."""

@@ -383,9 +383,12 @@ def _sizes_and_scales(
 
 
 def _outside(z: Array, lower: Array, upper: Array, E: Array) -> tuple[Array, Array]:
-    """Distances of knots (K, n) from a box, and their scales; NaN where there is no bound."""
+    """Distances of knots (K, n) from a box, and their scales; NaN where there is no bound.
+
+    A box of no width has the scale of an equality.
+    """
     width = upper - lower
-    scale = jnp.where(jnp.isfinite(width), jnp.minimum(width, WIDE * E), E)
+    scale = jnp.where(jnp.isfinite(width) & (width > 0.0), jnp.minimum(width, WIDE * E), E)
     free = jnp.isinf(lower) & jnp.isinf(upper)
     size = jnp.maximum(lower - z, z - upper)
     return jnp.maximum(size, 0.0), jnp.where(free, jnp.nan, scale)

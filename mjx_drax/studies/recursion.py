@@ -79,10 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for size in options.sizes:
         ndx, nu = map(int, size.split("x"))
         for chains in options.chains:
-            arguments = batch(chains, options.knots, ndx, nu)
-            given = arrays_of(arguments)
+            programs = batch(chains, options.knots, ndx, nu)
+            given = arrays_of(programs)
             kernels = kernels_for(given)
-            before, wanted = timed(plain, arguments, options.repeats)
+            before, wanted = timed(plain, programs, options.repeats)
             by_stages, found = timed(steps_in(kernels, 1), (given,), options.repeats)
             row = f"| {ndx}, {nu} | {chains:,} | {1e3 * before:.3f} | {1e3 * by_stages:.3f}"
             for count in options.segments or [segments(kernels, given)]:

@@ -23,6 +23,7 @@ from mjx_drax import (
     tasks,
 )
 from mjx_drax.base.errors import DraxWarning
+from mjx_drax.problem.trajectory import APART, Box
 
 
 def make(**changes):
@@ -176,3 +177,15 @@ def test_few_programs_replay_all_numbers_of_rows(name, caplog):
     with jax.log_compiles():
         run(3)
     assert not [record for record in caplog.records if "XLA compilation" in record.getMessage()]
+
+
+def test_equal_bounds_leave_a_little_room_in_plans():
+    """Of their own size, else of the coordinate's, else of 1; other bounds are as they were."""
+    lower = jnp.array([[-2.0, 0.0, 0.0, -jnp.inf], [0.5, 0.0, 0.0, 1.0]])
+    upper = jnp.array([[2.0, 0.0, 8.0, jnp.inf], [0.5, 0.0, 0.0, 1.0]])
+    box = Box(jnp.zeros(1), jnp.ones(1), lower, upper)
+    below, above = box.sides(Trajectory(jnp.zeros((2, 1)), jnp.zeros((2, 4))))
+    room = np.array([[0.0, 1.0, 0.0, 0.0], [0.5, 1.0, 8.0, 1.0]]) * APART / 2
+    np.testing.assert_allclose(below.u, lower - room, atol=1e-9)
+    np.testing.assert_allclose(above.u, upper + room, atol=1e-9)
+    np.testing.assert_array_equal((below.x, above.x), [[[0.0]] * 2, [[1.0]] * 2])

@@ -132,6 +132,41 @@ def test_where_most_places_disagree_one_more_attempt_looks_for_better_optima():
 
 
 @pytest.mark.slow
+def test_chains_at_the_goal_are_kept_though_others_are_cheaper():
+    """A mass between two wells: the goal is in the dearer one, which half of the chains come to."""
+
+    def well(x):
+        return 0.5 * (x[0] + 1.0) ** 2 * (x[0] - 2.0) ** 2 + 0.15 * (2.0 - x[0])
+
+    asked = []
+
+    def goal(x):
+        asked.append(x)
+        return abs(x[0] - 2.0) < 0.2
+
+    problem = from_function(
+        lambda x, u: x + DT * jnp.array([x[1], u[0]]),
+        x_init=[-1.0, 0.0],
+        nu=1,
+        dt=DT,
+        horizon=4.0,
+        running_cost=lambda x, u: 0.02 * well(x) + 0.05 * u[0] ** 2,
+        terminal_cost=lambda x: well(x) + x[1] ** 2,
+        u_bounds=(-2.0, 2.0),
+        x_bounds=([-3.0, -3.0], [4.0, 3.0]),
+        goal=goal,
+    )
+    found = solve(problem, chains=8)
+    assert found.success_rate == 1.0
+    assert len(asked) < 60  # plans that end alike are asked once
+    away = solve(replace(problem, goal=lambda x: abs(x[0] + 1.0) < 0.2), chains=8)
+    assert away.cost.max() < 0.6 * found.cost.min()
+    never = solve(replace(problem, goal=lambda x: False), chains=8, solver=Restarts(attempts=2))
+    assert len(never.history["began"]) == 3  # two attempts, and what they had left early
+    assert never.success_rate == 0.0
+
+
+@pytest.mark.slow
 def test_later_attempts_have_more_places_than_the_first(monkeypatch):
     monkeypatch.setattr(restarts, "ROOM", 4)
     solver = Restarts(replace(SHORT, iterations=20), attempts=2, done_share=2.0, tries=4)

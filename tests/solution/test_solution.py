@@ -546,3 +546,27 @@ def test_without_a_certificate_the_best_is_the_feasible_chain_with_the_cheapest_
     replays = replace(made.open_loop, cost=costs, success=np.zeros(4, bool))
     plans = {"cost": np.array([1.0, 1.9, 2.5, 0.1]), "max_defect": np.array([0.0, 0.0, 0.0, 1.0])}
     assert replace(made, open_loop=replays, feedback=replays, **plans).best_chain == 2
+
+
+@pytest.mark.slow
+def test_bounds_that_leave_no_choice_are_kept_like_constraints():
+    """No control in the first three knots, and one place to be at knot 6."""
+    lower, upper = np.full((K, 1), -4.0), np.full((K, 1), 4.0)
+    lower[:3] = upper[:3] = 0.0
+    low, high = np.full((K, 2), -5.0), np.full((K, 2), 5.0)
+    low[5, 0] = high[5, 0] = 0.4
+    found = solve(reach(u_bounds=(lower, upper), x_bounds=(low, high)), chains=4)
+    alike = reach(
+        u_bounds=(-4.0, 4.0),
+        equality=lambda x, u, knot: jnp.stack(
+            [jnp.where(knot.index < 3, u[0], 0.0), jnp.where(knot.index == 6, x[0] - 0.4, 0.0)]
+        ),
+    )
+    wanted = solve(alike, chains=4)
+    assert found.certified
+    assert found.optimal
+    # Plans have a little room where bounds leave none
+    np.testing.assert_allclose(found.cost.min(), wanted.cost.min(), rtol=1e-3)
+    states, controls = found.replayed
+    np.testing.assert_array_equal(controls[:3], 0.0)
+    assert abs(states[6, 0] - 0.4) < 1e-4
