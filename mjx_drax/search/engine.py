@@ -497,10 +497,11 @@ class Search:
     def _done_up_to(self, indices: np.ndarray, now: Chains | None = None) -> np.ndarray:
         """Up to which cost, from their floors, chains of those problems are done, (n, 1).
 
-        By what is kept, and by the rows of the chunk `now`.
+        By what is kept, and by the rows of the chunk `now`. Where cheaper plans miss the goal, what
+        reaches it may be far from its best, so no chain is done.
         """
         stage, kept, n = self.stage, self.stage.kept, len(indices)
-        costs, sizes = [], []
+        costs, sizes = [stage.least[indices, None]], [np.full((n, 1), np.nan)]
         if kept is not None:
             costs.append(self._sound_costs(kept, indices))
             sizes.append(np.asarray(kept.info.size).reshape(-1, self.chains)[indices])
