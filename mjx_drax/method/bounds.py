@@ -157,7 +157,7 @@ class LogBarrier(Bounds):
 
     def confine(self, box: Box, old: Trajectory, new: Trajectory) -> Trajectory:
         """`new`, each element held back so as to keep 1 - fraction of the slack it had in `old`."""
-        lower, upper = box.sides(old)
+        lower, upper = box.with_room().sides(old)
 
         def hold(z_old: Array, z_new: Array, a: Array, b: Array) -> Array:
             return jnp.clip(
@@ -168,11 +168,11 @@ class LogBarrier(Bounds):
 
     def interior(self, box: Box, trajectory: Trajectory) -> Trajectory:
         """The nearest trajectory at least 1 % of the box's width away from its ends."""
-        return _inside(box, trajectory, 1e-2)
+        return _inside(box.with_room(), trajectory, 1e-2)
 
     def barred(self, box: Box) -> Box:
         """All of it."""
-        return box
+        return box.with_room()
 
 
 @register_dataclass

@@ -5,7 +5,7 @@ A knot has a state, a control, and a `Knot`: its time, its number and the user's
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -118,10 +118,7 @@ class Box:
     start_upper: Array | None = None
 
     def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
-        """The lower and the upper end for every knot of a trajectory, as two trajectories.
-
-        Equal ends are moved apart by `APART`, as knots need an interior to move in.
-        """
+        """The lower and the upper end for every knot of a trajectory, as two trajectories."""
         x, u = trajectory.x, trajectory.u
         zeros = jax.tree.map(jnp.zeros_like, trajectory.slack)
         infinite = jax.tree.map(lambda s: jnp.full_like(s, jnp.inf), trajectory.slack)
@@ -133,14 +130,18 @@ class Box:
             whole = jnp.broadcast_to(of_x, x.shape), jnp.broadcast_to(of_u, u.shape)
             return Trajectory(*whole, of_slack, start)
 
-        x_ends, u_ends = _apart(self.x_lower, self.x_upper), _apart(self.u_lower, self.u_upper)
-        lower = side(x_ends[0], u_ends[0], zeros, self.start_lower)
-        upper = side(x_ends[1], u_ends[1], infinite, self.start_upper)
+        lower = side(self.x_lower, self.u_lower, zeros, self.start_lower)
+        upper = side(self.x_upper, self.u_upper, infinite, self.start_upper)
         return lower, upper
 
+    def with_room(self) -> Box:
+        """The box, equal ends moved apart by `APART`: a barrier needs an interior."""
+        x, u = _apart(self.x_lower, self.x_upper), _apart(self.u_lower, self.u_upper)
+        return replace(self, x_lower=x[0], x_upper=x[1], u_lower=u[0], u_upper=u[1])
+
     def violation(self, trajectory: Trajectory) -> Array:
-        """Largest distance by which any knot leaves the box, 0 if none does, scalar."""
-        lower, upper = self.sides(trajectory)
+        """Largest distance by which any knot leaves the box `with_room`, 0 if none does, scalar."""
+        lower, upper = self.with_room().sides(trajectory)
         out = jax.tree.map(
             lambda z, a, b: jnp.maximum((a - z).max(initial=0.0), (z - b).max(initial=0.0)),
             trajectory,

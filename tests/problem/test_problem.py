@@ -184,7 +184,7 @@ def test_equal_bounds_leave_a_little_room_in_plans():
     lower = jnp.array([[-2.0, 0.0, 0.0, -jnp.inf], [0.5, 0.0, 0.0, 1.0]])
     upper = jnp.array([[2.0, 0.0, 8.0, jnp.inf], [0.5, 0.0, 0.0, 1.0]])
     box = Box(jnp.zeros(1), jnp.ones(1), lower, upper)
-    below, above = box.sides(Trajectory(jnp.zeros((2, 1)), jnp.zeros((2, 4))))
+    below, above = box.with_room().sides(Trajectory(jnp.zeros((2, 1)), jnp.zeros((2, 4))))
     room = np.array([[0.0, 1.0, 0.0, 0.0], [0.5, 1.0, 8.0, 1.0]]) * APART / 2
     np.testing.assert_allclose(below.u, lower - room, atol=1e-9)
     np.testing.assert_allclose(above.u, upper + room, atol=1e-9)
