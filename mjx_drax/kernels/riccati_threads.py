@@ -105,7 +105,7 @@ def factorized(given: Given, interpret: bool = False) -> Array:
 def condensed(given: Given, interpret: bool = False) -> Link:
     """The stages of every row as one; of its last knot the cost is counted."""
     n = given.h.shape[-1]
-    found = Layout(J=tri(n), j=(n,), Phi=(n, n), phi=(n,), R=(n, n))
+    found = _link(n)
     packed = _through(condense, given, (1, found.size), interpret)
     link = {name: found.unpack(packed, name)[: len(given.h), 0] for name in found.shapes}
     return Link(**{**link, "J": symmetric_from(link["J"], n)})
@@ -114,7 +114,7 @@ def condensed(given: Given, interpret: bool = False) -> Link:
 def joined(links: Link, interpret: bool = False) -> tuple[Array, Array, Array]:
     """P and p after every segment, and W Phi, (rows, S, ...); see `riccati_segments`."""
     rows, S, n = links.j.shape
-    given = Layout(J=tri(n), j=(n,), Phi=(n, n), phi=(n,), R=(n, n))
+    given = _link(n)
     found = Layout(P=tri(n), p=(n,), WPhi=(n, n))
     packed = [given.pack(**links._replace(J=lower_triangle(links.J))._asdict())]
     body = partial(join, given)
@@ -199,6 +199,10 @@ def _factors(given: Given) -> Layout:
     n, m = given.B.shape[2:]
     Ls = {} if given.penalty is None else {"Ls": tri(n)}
     return Layout(K=(m, n), kff=(m,), Lu=tri(m), **Ls, P=tri(n), p=(n,))
+
+
+def _link(n: int) -> Layout:
+    return Layout(J=tri(n), j=(n,), Phi=(n, n), phi=(n,), R=(n, n))
 
 
 def _soft(given: Given) -> dict[str, tuple[int, ...]]:
@@ -497,10 +501,8 @@ def tri(n: int) -> tuple[int]:
 
 def symmetric_from(numbers: Array, n: int) -> Array:
     """The symmetric matrices (..., n, n) that have these lower triangles (..., n (n + 1) / 2)."""
-    i, j = (
-        np.maximum.outer(np.arange(n), np.arange(n)),
-        np.minimum.outer(np.arange(n), np.arange(n)),
-    )
+    k = np.arange(n)
+    i, j = np.maximum.outer(k, k), np.minimum.outer(k, k)
     return numbers[..., i * (i + 1) // 2 + j]
 
 
