@@ -74,7 +74,7 @@ from mjx_drax.problem.trajectory import Knot
 from mjx_drax.search.chains import Chains
 from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
-from mjx_drax.search.identity import identity
+from mjx_drax.search.identity import identity, look_again
 from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
@@ -256,6 +256,7 @@ class MPC:
             )
         require_plannable(problem)
         self.original, self.problem = problem, holding(problem, hold)
+        look_again(self.problem)
         self.solver = settled(self.problem, chains, seed, solver)
         metric = self.solver.flow.preconditioner
         if not metric.has_gains:

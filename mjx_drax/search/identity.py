@@ -21,9 +21,15 @@ from mjx_drax.base.structures import Unspelled, spelled
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.rollout import untraced
 
 _JAXS = {p for p in vars(primitives).values() if isinstance(p, Primitive)}
 """Operations whose rules are JAX's own."""
+
+REMEMBERED = 100
+"""Problems whose functions' texts are remembered."""
+
+_found: dict[Any, str] = {}
 
 
 def identity(arguments: Any, problem: Problem) -> str | None:
@@ -36,10 +42,36 @@ def identity(arguments: Any, problem: Problem) -> str | None:
     leaves, tree = jax.tree.flatten(problem)
     try:
         whole = spelled(jax.tree.structure(arguments), lambda kind: kind is Problem)
-        with full_precision:
-            return whole + _of_functions(jax.tree.unflatten(tree, map(_shape, leaves)))
+        found = _found.get(_kind(leaves, tree))
+        return whole + (found or _of_functions(leaves, tree))
     except Exception:  # whatever it is, JAX says it better of the program itself
         return None
+
+
+def look_again(problem: Problem) -> None:
+    """Let JAX forget all programs if functions of the problem compute something else than before.
+
+    JAX knows a function by its identity. If a global that it reads has another value now, the
+    programs that were compiled still have the old one.
+    """
+    leaves, tree = jax.tree.flatten(problem)
+    kind = _kind(leaves, tree)
+    before = _found.pop(kind, None)
+    try:
+        now = _of_functions(leaves, tree)
+    except Exception:  # as in `identity`
+        return
+    if before not in (None, now):
+        jax.clear_caches()
+        untraced.cache_clear()
+    _found[kind] = now
+    if len(_found) > REMEMBERED:
+        del _found[next(iter(_found))]
+
+
+def _kind(leaves: list[Any], tree: Any) -> Any:
+    """A problem's functions, and the kinds of its numbers."""
+    return tree, tuple(map(_shape, leaves)), jnp.result_type(float)
 
 
 def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -47,11 +79,10 @@ def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(jnp.shape(leaf), jax.dtypes.result_type(leaf), weak_type=weak)
 
 
-def _of_functions(problem: Problem) -> str:
-    """All functions of a problem, and f if it is made of functions, as programs of one knot.
-
-    They are traced each time: what they read of Python's objects may have changed.
-    """
+@full_precision
+def _of_functions(leaves: list[Any], tree: Any) -> str:
+    """All functions of a problem, and f if it is made of functions, as programs of one knot."""
+    problem: Problem = jax.tree.unflatten(tree, map(_shape, leaves))
     f, number = problem.dynamics, problem.x_init.dtype
     try:
         spelled(jax.tree.structure(f))

@@ -29,7 +29,10 @@ SHARES = (0.5, 0.2, 0.05)
 """Of what a round has changed, these are rolled out where all of it brings no improvement."""
 
 ALIKE = 1e-4
-"""Plans that end within this share of the largest entries end alike."""
+"""Plans that end within this share of the largest entries of motions end alike."""
+
+SOME = 256
+"""So many plans tell how large the entries of motions are."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Replayer:
             knots = chains.state.trajectory
             x, starts = np.asarray(knots.x), self.family.starts(self.indices, knots)
             ends = np.asarray(x[rows, -1], float)
-            size = np.maximum(np.abs(ends).max(axis=0), np.finfo(float).tiny)
+            size = np.abs(x[rows[:SOME]]).max(axis=(0, 1)) + np.finfo(float).tiny
             weights = np.random.default_rng(0).uniform(1.0, 2.0, len(size))
             keys = (np.round(ends / (ALIKE * size)) * weights).sum(axis=1)  # sorts sooner than rows
             _, first, which = np.unique(keys, return_index=True, return_inverse=True)

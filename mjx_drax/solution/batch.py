@@ -24,6 +24,7 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE, ranking
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.progress import reporting
@@ -234,6 +235,7 @@ def solve_batch(
     report = reporting(progress, "problems")
     keep_programs()
     family = Family.of(make, values)
+    look_again(family.problem)
     family = replace(family, problem=family.problem.in_precision(precision))
     with family.problem.arithmetic():
         tolerances = as_tolerances(tolerances)

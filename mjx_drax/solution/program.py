@@ -29,6 +29,7 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Progress, Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.log import history_of, table
@@ -221,6 +222,7 @@ def minimize(
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
     report = reporting(progress, program.name)
     keep_programs()
+    look_again(program)
     program = program.in_precision(precision)
     with program.arithmetic():
         knots = None if guess is None else _knots(guess, chains, program.dynamics.nu)

@@ -19,6 +19,7 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Progress, Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
@@ -99,6 +100,7 @@ def solve(
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
     report = reporting(progress, problem.name)
     keep_programs()
+    look_again(problem)
     problem = problem.in_precision(precision)
     with problem.arithmetic():
         tolerances = as_tolerances(tolerances)

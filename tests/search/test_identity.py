@@ -14,12 +14,12 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.tree_util import Partial
 
-from mjx_drax import MPC, from_dynamics, register_dataclass, solve
+from mjx_drax import MPC, from_dynamics, from_program, minimize, register_dataclass, solve
 from mjx_drax.control.mpc import _planner
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.search import iterate, sizes
-from mjx_drax.search.identity import identity
+from mjx_drax.search.identity import identity, look_again
 from mjx_drax.solution import violations
 
 TABLE = np.linspace(0.0, 1.0, 100_000, dtype=np.float32)
@@ -121,6 +121,34 @@ def test_what_functions_read_is_looked_at_each_time():
     assert before != of(problem)
     target[0] = 0.0
     assert before == of(problem)
+
+
+def test_jax_forgets_programs_only_if_what_functions_read_has_changed():
+    target = [0.5]
+    problem = posed(running_cost=lambda x, u: (x[0] - target[0]) ** 2)
+    program = jax.jit(lambda x: x + target[0])
+    for target[0], known in ((0.5, 0), (0.5, 1), (0.7, 0), (0.7, 1), (0.5, 0)):
+        look_again(problem)
+        assert program._cache_size() == known
+        assert program(1.0) == pytest.approx(1.0 + target[0])
+
+
+@pytest.mark.slow
+def test_another_program_has_what_functions_read_by_then():
+    target = [0.5]
+    program = from_program(1, cost=lambda x: (x[0] - target[0]) ** 2)
+    for target[0] in (0.5, -0.5):
+        assert np.allclose(minimize(program, chains=2, progress=False).x, target[0], atol=1e-3)
+
+
+@pytest.mark.slow
+def test_another_motion_has_what_functions_read_by_then():
+    target = [0.5]
+    reach = {"running_cost": lambda x, u: 1e-3 * u @ u + (x[0] - target[0]) ** 2}
+    problem = posed(terminal_residual=None, **reach)
+    for target[0] in (0.5, -0.5, 0.5):
+        ends = solve(problem, chains=2, progress=False).trajectories.x[:, -1, 0]
+        assert np.allclose(ends, target[0], atol=0.02)
 
 
 def test_rules_of_batches_count():
