@@ -56,7 +56,7 @@ def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     """The diagnostics of a trajectory whose functions have these values."""
     outside = problem.bounds.violation(trajectory)
     unknown = jnp.full_like(outside, jnp.nan)
-    return Info(values.cost, problem.worst(values), outside, unknown, unknown)
+    return Info(values.cost, problem.worst(values, trajectory.x), outside, unknown, unknown)
 
 
 def augmented_lagrangian(

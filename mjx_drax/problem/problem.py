@@ -44,6 +44,9 @@ CLOSE = 0.03
 PARTS = 12.0
 """States are measured in this fraction of their box, so that units do not matter."""
 
+ROUNDINGS = 1e4
+"""Defects are measured in no less than so many roundings of states: knots are no more exact."""
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -250,15 +253,15 @@ class Problem:
 
     def max_defect(self, trajectory: Trajectory) -> Array:
         """max|h| over dynamics and constraints, scalar: see `worst`."""
-        return self.worst(self.values(trajectory))
+        return self.worst(self.values(trajectory), trajectory.x)
 
-    def worst(self, values: Values) -> Array:
-        """max|h| of values that are known, scalar.
+    def worst(self, values: Values, x: Array) -> Array:
+        """max|h| of values that are known, at states x (K, nx), scalar.
 
-        Defects of the dynamics are measured in `defect_scale`, constraints as the user has them;
+        Defects of the dynamics are measured in `defect_unit`, constraints as the user has them;
         inequalities count where positive.
         """
-        defect = jnp.abs(values.defects / self.defect_scale).max(initial=0.0)
+        defect = jnp.abs(values.defects / self.defect_unit(x)).max(initial=0.0)
         return jnp.maximum(defect, self.worst_constraint(values.constraints))
 
     def worst_constraint(self, values: Stagewise) -> Array:
@@ -282,6 +285,16 @@ class Problem:
         """What states are measured in, (ndx,): a twelfth of their box; 1 where it has no width."""
         width = self.widths[0]
         return jnp.where(width > 0.0, width / PARTS, 1.0)
+
+    def defect_unit(self, x: Array) -> Array:
+        """What defects at states x (K, nx) are measured in, (ndx,).
+
+        That is `defect_scale`, or `ROUNDINGS` of the largest states where these are so far out of
+        their box, as a position in metres on an orbit whose box nobody has given.
+        """
+        largest = self.dynamics.tangent(jnp.abs(x).max(axis=0, initial=0.0))
+        rounding = jnp.finfo(self.x_init.dtype).eps * largest
+        return jnp.maximum(self.defect_scale, ROUNDINGS * rounding)
 
     def no_change(self, trajectory: Trajectory) -> Trajectory:
         """The displacement of nothing: zeros in tangent space, (K, ndx) and (K, nu)."""

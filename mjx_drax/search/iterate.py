@@ -33,7 +33,7 @@ from mjx_drax.search.identity import identity
 from mjx_drax.search.scaled import without_units
 
 FEASIBLE = 1e-3
-"""Largest max|h| of a feasible chain: of defects in `Problem.defect_scale`, and of constraints."""
+"""Largest max|h| of a feasible chain: of defects in `Problem.defect_unit`, and of constraints."""
 
 BOUND = 5e-3
 """Share of the box of states by which a rollout may leave it and be polished back."""

@@ -29,9 +29,12 @@ LIMIT = 500_000_000
 @jax.jit
 @full_precision
 def knot_defects(problem: Problem, trajectory: Trajectory) -> Array:
-    """max|h_k| of each knot of a batch of chains, in `problem.defect_scale`, (chains, K)."""
-    scale = problem.defect_scale
-    return jax.vmap(lambda z: jnp.abs(problem.defects(z) / scale).max(axis=1))(trajectory)
+    """max|h_k| of each knot of a batch of chains, in `problem.defect_unit`, (chains, K)."""
+
+    def of_chain(z: Trajectory) -> Array:
+        return jnp.abs(problem.defects(z) / problem.defect_unit(z.x)).max(axis=1)
+
+    return jax.vmap(of_chain)(trajectory)
 
 
 @dataclass(frozen=True)

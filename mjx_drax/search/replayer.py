@@ -225,7 +225,8 @@ class Replayer:
         plan, u = self._plans(knots), np.asarray(knots.u)
         for index in np.unique(self.of[which]):
             problem, rows = family.at(int(index)), which[self.of[which] == index]
-            off = problem.engine_defects(plan[rows], u[rows]) / np.asarray(problem.defect_scale)
+            unit = jax.vmap(problem.defect_unit)(knots.x[rows])
+            off = problem.engine_defects(plan[rows], u[rows]) / np.asarray(unit)[:, None]
             defect[rows] = np.maximum(off.max(axis=(1, 2)), broken[rows])
         return replace(info, max_defect=jnp.asarray(defect))
 

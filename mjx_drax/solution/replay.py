@@ -193,7 +193,7 @@ def plan_violations(family: Family, plan: np.ndarray, u: np.ndarray) -> Violatio
 
 def largest_defect(problem: Problem, plan: np.ndarray, u: np.ndarray) -> Violation:
     """Where one plan breaks the dynamics most; see `Problem.engine_defects`."""
-    off, allowed = problem.engine_defects(plan, u), FEASIBLE * np.asarray(problem.defect_scale)
+    off, allowed = problem.engine_defects(plan, u), FEASIBLE * np.asarray(problem.defect_unit(plan))
     knot, entry = np.unravel_index(int((off / allowed).argmax()), off.shape)
     tolerated = float(allowed[entry])
     return Violation(DYNAMICS, float(off[knot, entry]), tolerated, int(entry), int(knot))

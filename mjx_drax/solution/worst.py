@@ -26,11 +26,11 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
     """Violations of a chain's plan, those of the dynamics included, the worst first.
 
     Dynamics and constraints are tolerated up to what makes a plan feasible: 1e-3 of the problem's
-    `defect_scale` of a state, and 1e-3 of a constraint.
+    `defect_unit` of a state, and 1e-3 of a constraint.
     """
     problem, plan, u, extent = _motion(solution, chain)
     off = problem.engine_defects(plan, u)
-    allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.defect_scale), off.shape)
+    allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.defect_unit(plan)), off.shape)
     found = list(worst_knots(DYNAMICS, off, allowed, 0))
     none = np.zeros(problem.dynamics.ndx)
     for violation in by_entry(problem, (plan, u), none, extent, Tolerances()):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import point
 from jax.tree_util import Partial
 
 from mjx_drax import (
@@ -189,3 +190,14 @@ def test_equal_bounds_leave_a_little_room_in_plans():
     np.testing.assert_allclose(below.u, lower - room, atol=1e-9)
     np.testing.assert_allclose(above.u, upper + room, atol=1e-9)
     np.testing.assert_array_equal((below.x, above.x), [[[0.0]] * 2, [[1.0]] * 2])
+
+
+def test_a_defect_below_the_rounding_of_a_state_is_none():
+    # 7e6 m away knots of float32 are half a metre apart; the box of 2 m around x_init is a guess
+    p, far = point(x_init=[7e6, 0.0]), 7e6 + 0.5
+    knots = Trajectory(jnp.array([[far, 0.0]] * p.horizon), jnp.zeros((p.horizon, 2)))
+    assert p.max_defect(knots) < 1e-3
+    off = Trajectory(knots.x.at[3, 1].set(1e-3), knots.u)  # no rounding of what is near 0
+    assert p.max_defect(off) == pytest.approx(1e-3 / (2.0 / 12.0), rel=1e-3)
+    with jax.enable_x64(True):
+        assert p.in_float64().max_defect(knots) > 1e-3

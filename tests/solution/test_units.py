@@ -242,3 +242,21 @@ def test_the_answer_to_each_terminal_weight_is_the_cheapest_at_that_weight(name)
         problem = made(name, terminal=weight)
         own, *others = (float(problem.cost(replace(z, slack=None))) for z in (mine, *answers))
         assert own <= 1.002 * min(others), weight
+
+
+@pytest.mark.slow
+def test_states_may_be_of_any_size_though_nobody_gives_their_box():
+    given = {n: PROBLEMS["line"][n] for n in ("nu", "dt", "horizon", "u_bounds")}
+    costs = []
+    for size in (1.0, 1e6):
+        problem = from_function(
+            partial(in_units, mass, size),
+            x_init=[-size, 0.0],
+            running_residual=partial(in_metres, partial(effort, 0.02), size),
+            terminal_residual=partial(in_metres, PROBLEMS["line"]["terminal_residual"], size),
+            **given,
+        )
+        found = solve(problem, chains=4, progress=False)
+        assert found.certified and found.optimal
+        costs.append(found.replay_cost[found.best_chain])
+    assert costs[1] == pytest.approx(costs[0], rel=1e-3)
