@@ -52,7 +52,7 @@ def shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
     beyond = jax.lax.fori_loop(0, steps, ahead, jnp.tile(knots.x[-1], (AHEAD, 1)))
     beyond = jnp.where(jnp.isfinite(beyond), beyond, knots.x[-1])
     inside = flow.bounds.interior(
-        problem.bounds, Trajectory(beyond, jnp.broadcast_to(knots.u[-1], (AHEAD, dynamics.nu)))
+        problem.plan_bounds, Trajectory(beyond, jnp.broadcast_to(knots.u[-1], (AHEAD, dynamics.nu)))
     )
     x = jax.vmap(lambda a, b, w: dynamics.integrate(a, w * dynamics.difference(b, a)))(
         *between(jnp.concatenate([knots.x, inside.x]), place_after)

@@ -54,7 +54,7 @@ class Info:
 
 def diagnosed(problem: Problem, trajectory: Trajectory, values: Values) -> Info:
     """The diagnostics of a trajectory whose functions have these values."""
-    outside = problem.bounds.violation(trajectory)
+    outside = problem.plan_bounds.violation(trajectory)
     unknown = jnp.full_like(outside, jnp.nan)
     return Info(values.cost, problem.worst(values, trajectory.x), outside, unknown, unknown)
 
@@ -72,7 +72,7 @@ def augmented_lagrangian(
     Two trajectories are compared by summing the differences of their terms, which keeps far more
     digits in float32 than the difference of their sums.
     """
-    barrier = weights.barrier * bounds.value(problem.bounds, trajectory)
+    barrier = weights.barrier * bounds.value(problem.plan_bounds, trajectory)
     return jnp.append(barrier, 0.0) + penalized(problem, trajectory, values, multipliers, weights)
 
 
@@ -92,7 +92,7 @@ def line_search(
 
     def candidate(alpha: Array) -> tuple[Array, tuple[Trajectory, Array, Info]]:
         step = jax.tree.map(lambda d: alpha * d, drift)
-        new = bounds.confine(problem.bounds, old, problem.displaced(old, step))
+        new = bounds.confine(problem.plan_bounds, old, problem.displaced(old, step))
         values = problem.values(new)
         merit = augmented_lagrangian(problem, bounds, new, multipliers, weights, values)
         return merit, (new, alpha, diagnosed(problem, new, values))
@@ -136,7 +136,7 @@ def metropolis(
     energy = jnp.sum(merit(new) - merit(old)) / weights.noise**2
     log_ratio = -energy + log_proposal(new, old, drifts[1]) - log_proposal(old, new, drifts[0])
     uniform = jax.random.uniform(jax.random.fold_in(key, 1))
-    accepted = (jnp.log(uniform) < log_ratio) & (problem.bounds.violation(new) == 0.0)
+    accepted = (jnp.log(uniform) < log_ratio) & (problem.plan_bounds.violation(new) == 0.0)
     return jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
 
 
@@ -148,7 +148,7 @@ def adapted(
     The multipliers of bounds take Newton's step.
     """
     knots, v = (old.trajectory, new.trajectory), old.multipliers.bounds
-    v = bounds.follow(problem.bounds, *knots, v, weights.barrier, alpha)
+    v = bounds.follow(problem.plan_bounds, *knots, v, weights.barrier, alpha)
     short = jnp.where(alpha < SHORT_STEP, MORE_DAMPING, 1.0)
     factor = jnp.where(alpha >= 1.0, LESS_DAMPING, short)
     damping = jnp.clip(factor * old.damping, *DAMPING_RANGE)

@@ -121,7 +121,7 @@ class Langevin:
             multipliers=Multipliers(
                 jnp.zeros((K, ndx)),
                 Stagewise(jnp.zeros((K, stage.rows)), jnp.zeros(end.rows)),
-                self.bounds.multipliers(problem.bounds, knots, rho),
+                self.bounds.multipliers(problem.plan_bounds, knots, rho),
             ),
             damping=jnp.ones(()),
             gains=jnp.zeros((K, nu, ndx)),
@@ -135,7 +135,7 @@ class Langevin:
         """The knots inside the bounds, with slacks that satisfy g + s = 0 where g <= 0."""
         g = problem.inequalities(trajectory)
         slack = jax.tree.map(lambda g: jnp.maximum(-g, SLACK), g)
-        return self.bounds.interior(problem.bounds, replace(trajectory, slack=slack))
+        return self.bounds.interior(problem.plan_bounds, replace(trajectory, slack=slack))
 
     def step(
         self,
@@ -201,11 +201,11 @@ class Langevin:
             chain = state.multipliers, weights, alpha, (to.drift, back.drift)
             new = descent.metropolis(problem, bounds, X, new, *chain, key)
         else:
-            new = bounds.confine(problem.bounds, X, new)
+            new = bounds.confine(problem.plan_bounds, X, new)
         moved = self._moved(state, new, jnp.asarray(alpha), to)
         if not tail:
             return moved
-        v = bounds.multipliers(problem.bounds, new, weights.barrier)  # central, for the tail
+        v = bounds.multipliers(problem.plan_bounds, new, weights.barrier)  # central, for the tail
         return replace(moved, multipliers=replace(moved.multipliers, bounds=v))
 
     def _moved(self, state: State, X: Trajectory, alpha: Array, to: Direction) -> State:

@@ -116,7 +116,7 @@ def expand(
 
     Without `by` only the gradient is made, by one reverse-mode derivative of L_mu.
     """
-    present = problem.bounds, trajectory, weights.barrier, multipliers.bounds
+    present = problem.plan_bounds, trajectory, weights.barrier, multipliers.bounds
     slope, curvature = bounds.derivatives(*present)
     tangent = problem.dynamics.tangent
     barrier = replace(slope, x=tangent(slope.x)), replace(curvature, x=tangent(curvature.x))

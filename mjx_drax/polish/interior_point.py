@@ -322,7 +322,7 @@ def _inside(problem: Problem, model: Model, scales: Scales) -> Trajectory:
             stage[problem.constraint.equalities :], end[problem.terminal_constraint.equalities :]
         )
         slack = jax.tree.map(lambda g, scale: jnp.maximum(-g, MARGIN * scale), g, rows)
-    lower, upper = problem.bounds.with_room().sides(replace(knots, slack=None))
+    lower, upper = problem.plan_bounds.with_room().sides(replace(knots, slack=None))
 
     def inside(z: Array, a: Array, b: Array, moves: Array) -> Array:
         gap = MARGIN * jnp.where(jnp.isfinite(b - a), b - a, moves)

@@ -189,7 +189,7 @@ def products(problem: Problem, knots: Trajectory, v: Sides) -> Sides:
 
 def slacks_of(problem: Problem, knots: Trajectory) -> Sides:
     """Distances from the lower and the upper ends; infinite where there is none."""
-    lower, upper = problem.bounds.with_room().sides(knots)
+    lower, upper = problem.plan_bounds.with_room().sides(knots)
     return jax.tree.map(jnp.subtract, knots, lower), jax.tree.map(jnp.subtract, upper, knots)
 
 

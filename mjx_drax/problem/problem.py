@@ -281,12 +281,17 @@ class Problem:
         return of(tangent(box.x_upper - box.x_lower)), of(box.u_upper - box.u_lower)
 
     @property
+    def plan_bounds(self) -> Box:
+        """The bounds of plans: `Box.opened_at` x_init in float32. In float64 no room is needed."""
+        return self.bounds if self.precision == 64 else self.bounds.opened_at(self.x_init)
+
+    @property
     def defect_scale(self) -> Array:
         """What states are measured in, (ndx,): a twelfth of their box; 1 where it has no width."""
         width = self.widths[0]
         return jnp.where(width > 0.0, width / PARTS, 1.0)
 
-    def defect_unit(self, x: Array) -> Array:
+    def defect_unit(self, x: Array | np.ndarray) -> Array:
         """What defects at states x (K, nx) are measured in, (ndx,).
 
         That is `defect_scale`, or `ROUNDINGS` of the largest states where these are so far out of

@@ -139,6 +139,18 @@ class Box:
         x, u = _apart(self.x_lower, self.x_upper), _apart(self.u_lower, self.u_upper)
         return replace(self, x_lower=x[0], x_upper=x[1], u_lower=u[0], u_upper=u[1])
 
+    def opened_at(self, x: Array) -> Box:
+        """The box, those ends of states moved outwards at which x (nx,) lies.
+
+        A motion that starts on its bound, as a mass at rest at a wall, cannot leave it at once: for
+        its first states there is no interior.
+        """
+        lower, upper = self.x_lower, self.x_upper
+        below, above = _room(lower, upper), _room(upper, lower)
+        lower = jnp.where(jnp.abs(x - lower) <= below, lower - below, lower)
+        upper = jnp.where(jnp.abs(x - upper) <= above, upper + above, upper)
+        return replace(self, x_lower=lower, x_upper=upper)
+
     def violation(self, trajectory: Trajectory) -> Array:
         """Largest distance by which any knot leaves the box `with_room`, 0 if none does, scalar."""
         lower, upper = self.with_room().sides(trajectory)
@@ -153,13 +165,17 @@ class Box:
 
 
 def _apart(lower: Array, upper: Array) -> tuple[Array, Array]:
-    """The ends, `APART` where they are equal: of their own size, else the coordinate's, else 1."""
-    ends = jnp.stack(jnp.broadcast_arrays(jnp.atleast_2d(lower), jnp.atleast_2d(upper)))
+    """The ends, `APART` where they are equal."""
+    half = jnp.where(lower == upper, _room(lower, upper), 0.0)
+    return lower - half, upper + half
+
+
+def _room(end: Array, other: Array) -> Array:
+    """Half of `APART`, of the end's own size, else of the coordinate's, else of 1."""
+    ends = jnp.stack(jnp.broadcast_arrays(jnp.atleast_2d(end), jnp.atleast_2d(other)))
     sizes = jnp.where(jnp.isfinite(ends), jnp.abs(ends), 0.0).max(axis=(0, 1), initial=0.0)
     of_coordinate = jnp.where(sizes > 0.0, sizes, 1.0)
-    own = jnp.where(lower == 0.0, of_coordinate, jnp.abs(lower))
-    half = jnp.where(lower == upper, 0.5 * APART * own, 0.0)
-    return lower - half, upper + half
+    return 0.5 * APART * jnp.where(end == 0.0, of_coordinate, jnp.abs(end))
 
 
 def _pair(label: str, ends: Any) -> tuple[ArrayLike, ArrayLike]:

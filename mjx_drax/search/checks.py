@@ -227,7 +227,8 @@ def _warn_of_start(u: np.ndarray, constraints: dict[str, np.ndarray]) -> None:
 @jax.jit
 def _starts(flow: Langevin, problem: Problem, knots: Trajectory) -> tuple[Array, Array]:
     """x_init and last states, each beside the first control, (chains, 1, nx + nu)."""
-    inside = jax.vmap(partial(flow.bounds.interior, problem.bounds))(replace(knots, slack=None))
+    interior = partial(flow.bounds.interior, problem.plan_bounds)
+    inside = jax.vmap(interior)(replace(knots, slack=None))
     u = inside.u[:, :1]
     start = jnp.broadcast_to(problem.x_init, (*u.shape[:2], problem.dynamics.nx))
     last = inside.x[:, -1:]

@@ -133,7 +133,7 @@ def _inside(problem: Problem, knots: Trajectory) -> Trajectory:
     if g is not None and slack is None:
         slack = jax.tree.map(lambda g: jnp.maximum(-g, 0.0), g)
     knots = replace(knots, slack=slack)
-    lower, upper = problem.bounds.with_room().sides(knots)
+    lower, upper = problem.plan_bounds.with_room().sides(knots)
 
     def inside(z: Array, a: Array, b: Array) -> Array:
         width = jnp.where(jnp.isfinite(b - a), b - a, 1.0)

@@ -192,6 +192,15 @@ def test_equal_bounds_leave_a_little_room_in_plans():
     np.testing.assert_array_equal((below.x, above.x), [[[0.0]] * 2, [[1.0]] * 2])
 
 
+def test_bounds_at_which_a_plan_starts_are_opened():
+    lower, upper = jnp.array([0.0, -1.0, -jnp.inf, 0.0]), jnp.array([2.0, 3.0, jnp.inf, 1.0])
+    box = Box(lower, upper, jnp.zeros(1), jnp.ones(1)).opened_at(jnp.array([0.0, 3.0, 7.0, 0.5]))
+    room = np.array([2.0, 3.0]) * APART / 2  # of the coordinate's size, of the end's own
+    np.testing.assert_allclose(box.x_lower - lower, [-room[0], 0.0, np.nan, 0.0], atol=1e-9)
+    np.testing.assert_allclose(box.x_upper - upper, [0.0, room[1], np.nan, 0.0], atol=2e-7)
+    np.testing.assert_array_equal((box.u_lower, box.u_upper), [[0.0], [1.0]])
+
+
 def test_a_defect_below_the_rounding_of_a_state_is_none():
     # 7e6 m away knots of float32 are half a metre apart; the box of 2 m around x_init is a guess
     p, far = point(x_init=[7e6, 0.0]), 7e6 + 0.5

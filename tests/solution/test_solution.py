@@ -570,3 +570,12 @@ def test_bounds_that_leave_no_choice_are_kept_like_constraints():
     states, controls = found.replayed
     np.testing.assert_array_equal(controls[:3], 0.0)
     assert abs(states[6, 0] - 0.4) < 1e-4
+
+
+@pytest.mark.slow
+def test_a_motion_may_start_and_end_on_its_bounds():
+    """They forbid nothing that the best motion without them would do."""
+    kept = solve(reach(x_bounds=([0.0, 0.0], [1.0, 5.0])), chains=4)
+    free = solve(reach(), chains=4)
+    assert kept.optimal_chains.all()
+    np.testing.assert_allclose(kept.cost, free.cost.min(), rtol=1e-3)
