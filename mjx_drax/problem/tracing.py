@@ -3,10 +3,11 @@
 A cost is called with arrays that have shapes and no values. That shows what it returns, and what it
 computes: its jaxpr. If two traces differ, the function reads something besides its arguments that
 changes (a counter, random numbers, the time). If its value depends on its arguments and the tangent
-of its value does not, its derivative is zero everywhere, and no solver can follow it.
+of its value does not, its derivative is zero everywhere, and no solver can follow it. Of an entry
+that an array does not have, JAX would take another one.
 
 A function that reads a global which changes later cannot be told from one that reads a constant:
-what was read when it was traced stays.
+what was read stays until the next solve looks again (`search.identity`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
+from jax.tree_util import Partial
 
 from mjx_drax.base.errors import DraxError, reason, shown
 
@@ -54,7 +56,8 @@ def traced(label: str, function: Callable[..., Any], arguments: Arguments) -> ja
         out = function(*values)
         dtype = getattr(out, "dtype", None) if hasattr(out, "shape") else np.result_type(float)
         if dtype is None or not (hasattr(out, "shape") or isinstance(out, float)):
-            raise DraxError(f"{label} returned {_described(out)}: return one array of floats.")
+            way = _missing(function) or "Return one array of floats"
+            raise DraxError(f"{label} returned {_described(out)}. {way}.")
         if not jnp.issubdtype(dtype, jnp.floating):
             raise DraxError(
                 f"{label} returned an array of {dtype}: it must return one array of floats; "
@@ -62,26 +65,86 @@ def traced(label: str, function: Callable[..., Any], arguments: Arguments) -> ja
             )
         return out
 
-    first, second = (_jaxpr(label, one_array, arguments) for _ in range(2))
+    first, second = (_jaxpr(label, function, one_array, arguments) for _ in range(2))
     if _fingerprint(first) != _fingerprint(second):
         raise DraxError(
             f"{label} computed something else when it was called again: it depends on a global, on "
             "random numbers or on the time. Make it a function of its arguments alone."
         )
+    for index, shape in _out_of_range(first):
+        raise DraxError(
+            f"{label} reads [{index}] of an array of shape {shape}, which has no such entry, so "
+            "JAX would take another one. Change the index: entries count from 0."
+        )
     return first.out_avals[0]
 
 
-def _jaxpr(label: str, function: Callable[..., Any], arguments: Arguments) -> ClosedJaxpr:
+def _jaxpr(
+    label: str, function: Callable[..., Any], one_array: Callable[..., Any], arguments: Arguments
+) -> ClosedJaxpr:
+    """What `one_array` computes, which calls the user's function."""
     try:
-        return jax.make_jaxpr(lambda *values: function(*values))(*arguments)  # a new one: no cache
+        return jax.make_jaxpr(lambda *values: one_array(*values))(*arguments)  # a new one: no cache
     except DraxError:
         raise
     except Exception as error:
-        raise DraxError(
-            f"{label} failed when it was traced: {plain(error)}. Make it a JAX function of its "
-            f"{len(arguments)} argument{'s' * (len(arguments) > 1)}: jax.numpy, and no Python "
-            "branches on values."
-        ) from error
+        count = f"{len(arguments)} argument{'s' * (len(arguments) > 1)}"
+        if isinstance(error, _OF_TRACED):
+            way = f"Make it a JAX function of its {count}: jax.numpy, and no Python branches"
+            way += " on values"
+        else:
+            given = " and ".join(map(_kind, arguments))
+            way = _missing(function) or f"Change it: it is called with {count}, {given}"
+        raise DraxError(f"{label} failed when it was traced: {plain(error)}. {way}.") from error
+
+
+_OF_TRACED = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.UnexpectedTracerError,
+)
+"""Errors of functions that ask for what only values have."""
+
+_ASKED_BY = {"data": "data=", "parameters": "parameters=", "rate": "rates=1", "jerk": "rates=2"}
+"""What of a knot is None unless an argument asks for it."""
+
+
+def _missing(function: Any) -> str:
+    """What a function reads of its knot and the problem has not; nothing if that is not known."""
+    knot = getattr(function, "keywords", {}).get("knot")
+    while isinstance(function, Partial):
+        function = function.args[0] if function.args else function.func
+    read = getattr(getattr(function, "__code__", None), "co_names", ())
+    for name, argument in _ASKED_BY.items():
+        if knot is not None and name in read and getattr(knot, name) is None:
+            return f"Give {argument}: without it knot.{name} is None"
+    return ""
+
+
+def _kind(argument: Any) -> str:
+    argument = getattr(argument, "seen", argument)  # of a knot that is given beside it
+    shape = getattr(argument, "shape", None)
+    return f"a {type(argument).__name__}" if shape is None else f"an array of shape {shape}"
+
+
+def _out_of_range(closed: ClosedJaxpr) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Indices that are the same for all arguments and that an array does not have, and its shape.
+
+    Those that it has are read by another operation than these.
+    """
+    jaxpr = closed.jaxpr
+    for equation in jaxpr.eqns:
+        if equation.primitive.name != "dynamic_slice":
+            continue
+        array, *starts = equation.invars
+        indices, used = dce_jaxpr(jaxpr.replace(outvars=starts), [True] * len(starts))
+        if any(used):
+            continue
+        found = jax.core.eval_jaxpr(indices, closed.consts)
+        sizes = equation.params["slice_sizes"]
+        for start, size, length in zip(found, sizes, array.aval.shape, strict=True):
+            if not 0 <= int(start) <= length - size:
+                yield int(start) - length * (start < 0), array.aval.shape
 
 
 def plain(error: Exception) -> str:
@@ -94,7 +157,7 @@ def plain(error: Exception) -> str:
         return "it kept a traced value in a global and used it again; remove that"
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return "float(), int() or a shape made of a value; use jax.numpy on arrays"
-    return reason(error).replace("jax.", "").replace("Tracer", "traced value")
+    return reason(error).replace("jax.", "").replace("Tracer", "traced value").rstrip(".")
 
 
 def _described(out: Any) -> str:

@@ -164,10 +164,10 @@ def _only(solution: Results) -> str:
     )
 
 
-def _most_bounded(solution: Results) -> str:
-    """Which entry of the best plan is at an end of its range most often, in a tenth of the knots.
+def _most_bounded(solution: Results) -> tuple[str, float]:
+    """Which entry of the best plan is at an end of its range most often, and at a share of knots.
 
-    Nothing if none is in so many.
+    Nothing is said of less than a tenth.
     """
     dynamics, box = solution.problem.dynamics, solution.problem.bounds
     knots, chain, found = solution.trajectories, solution.best_chain, []
@@ -182,7 +182,8 @@ def _most_bounded(solution: Results) -> str:
         found += list(zip(on.sum(axis=0).tolist(), names, strict=True))
     times, name = max(found, key=lambda entry: entry[0])
     K = solution.problem.horizon
-    return f", and {name} is on a bound at {times} of {K} knots" if times >= 0.1 * K else ""
+    said = f", and {name} is on a bound at {times} of {K} knots" if times >= 0.1 * K else ""
+    return said, times / K
 
 
 def _advice(solution: Results) -> str:
@@ -191,13 +192,16 @@ def _advice(solution: Results) -> str:
         return "the solve was interrupted. Let it go on to its end."
     where = solution.where(solution.best_chain)
     if where is not None:
+        bounded, share = _most_bounded(solution)
         unfinished = solution.polished[solution.best_chain] == UNFINISHED
-        more = ", more max_iterations" if unfinished else ""
+        more = ["more iterations"] + ["more max_iterations"] * unfinished
         free = solution.problem.dynamics.phases
-        longer = "longer durations" if free else "a longer horizon"
+        more.append("longer durations" if free else "a longer horizon")
+        if share >= 0.5:  # it does all it may, and time or room is what is missing
+            more = ["wider bounds", *more[::-1]]
         return (
-            f"no plan is feasible; the best {where.told(solution.problem)}"
-            f"{_most_bounded(solution)}. Try more iterations{more}, or {longer}."
+            f"no plan is feasible; the best {where.told(solution.problem)}{bounded}. "
+            f"Try {', '.join(more[:-1])}, or {more[-1]}."
         )
     unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])
     if unplanned is not None:

@@ -2,7 +2,6 @@
 
 What the library cannot find out, and so is not here:
 
-- a cost that reads a global which changes after the solve has compiled it: JAX keeps what it read;
 - a cost that is wrong in one region of the state space only: its chains diverge, and are marked;
 - a cost that never returns.
 """
@@ -187,6 +186,18 @@ COSTS = [
     ("math", lambda at: with_cost(lambda x, u: math.sin(x[0])), "running_cost failed", "float()"),
     ("in-place", lambda at: with_cost(lambda x, u: x.__setitem__(0, 1.0)), "running_cost failed"),
     ("wrong-shapes", lambda at: with_cost(lambda x, u: x @ jnp.zeros(3)), "running_cost failed"),
+    ("no-such-entry", lambda at: with_cost(lambda x, u: u[2] ** 2), "reads [2]", "shape (2,)"),
+    ("no-such-entry-from-the-end", lambda at: with_cost(lambda x, u: x[-3]), "reads [-3]"),
+    ("no-such-column", lambda at: with_cost(lambda x, u: jnp.outer(x, u)[1, 5]), "reads [5]"),
+    ("no-rates", lambda at: with_residual(running_residual=lambda x, u, knot: knot.rate),
+     "returned None", "rates=1"),
+    ("no-data", lambda at: with_cost(lambda x, u, knot: knot.data["mass"] * u @ u), "data="),
+    ("no-parameters", lambda at: with_cost(lambda x, u, knot: knot.parameters["mass"] * u @ u),
+     "parameters="),
+    ("no-such-parameter",
+     lambda at: solved(running_cost=lambda x, u, knot: knot.parameters["mass"] * u @ u,
+                       parameters={"length": (0.1, 1.0)}),
+     "KeyError: 'mass'", "shape (2,)"),
     ("counter", lambda at: with_cost(counting), "running_cost", "global"),
     ("random", lambda at: with_cost(lambda x, u: random.random() * (x @ x)), "random numbers"),
     ("random-array",

@@ -47,6 +47,9 @@ def test_an_infeasible_plan_says_which_bound_it_lies_on():
         advice = str(replace(far, trajectories=replace(made.trajectories, u=u))).splitlines()[-1]
         assert f"{said}. Try more iterations, or a longer horizon." in advice
         assert ("on a bound" in advice) == bool(said)
+    u[:, :, 1] = value
+    advice = str(replace(far, trajectories=replace(made.trajectories, u=u))).splitlines()[-1]
+    assert "10 of 10 knots. Try wider bounds, a longer horizon, or more iterations." in advice
 
 
 def test_an_infeasible_plan_of_free_duration_is_to_take_longer():
