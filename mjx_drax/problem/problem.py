@@ -283,7 +283,16 @@ class Problem:
     @property
     def plan_bounds(self) -> Box:
         """The bounds of plans: `Box.opened_at` x_init in float32. In float64 no room is needed."""
-        return self.bounds if self.precision == 64 else self.bounds.opened_at(self.x_init)
+        done = self.bounds.roomy is not None or self.precision == 64
+        return self.bounds if done else self.bounds.opened_at(self.x_init)
+
+    def prepared(self) -> Problem:
+        """The problem with what its bounds are to plans, for loops.
+
+        XLA moves it out of a loop, but not out of the loop's branches.
+        """
+        box = self.plan_bounds
+        return replace(self, bounds=replace(box, roomy=box.with_room()))
 
     @property
     def defect_scale(self) -> Array:

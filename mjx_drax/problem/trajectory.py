@@ -107,7 +107,8 @@ APART = 4e-5
 class Box:
     """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free.
 
-    Where x_0 is free, also those of `Trajectory.start`, (n0,).
+    Where x_0 is free, also those of `Trajectory.start`, (n0,). `roomy` is what `with_room` gives, if
+    that is known.
     """
 
     x_lower: Array
@@ -116,6 +117,7 @@ class Box:
     u_upper: Array
     start_lower: Array | None = None
     start_upper: Array | None = None
+    roomy: Box | None = None
 
     def sides(self, trajectory: Trajectory) -> tuple[Trajectory, Trajectory]:
         """The lower and the upper end for every knot of a trajectory, as two trajectories."""
@@ -136,6 +138,8 @@ class Box:
 
     def with_room(self) -> Box:
         """The box, equal ends moved apart by `APART`: a barrier needs an interior."""
+        if self.roomy is not None:
+            return self.roomy
         x, u = _apart(self.x_lower, self.x_upper), _apart(self.u_lower, self.u_upper)
         return replace(self, x_lower=x[0], x_upper=x[1], u_lower=u[0], u_upper=u[1])
 

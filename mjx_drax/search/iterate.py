@@ -216,7 +216,8 @@ def loop(
     states, own = rows
 
     def flow_step(i: Array, moves: Array | None, q: Question, state: State) -> tuple[State, Info]:
-        return q.flow.step(q.problem, state, i + q.offset, tail, noise, moves, mixed)
+        problem = q.problem.prepared()
+        return q.flow.step(problem, state, i + q.offset, tail, noise, moves, mixed)
 
     if shared.polish is not None:
 
@@ -269,7 +270,7 @@ def iteration(i: Array, q: Question, state: State) -> State:
 
     The penalty goes half its way; see `Restarts`. Between the two the chain is projected.
     """
-    flow, problem, polish, i = q.flow, q.problem, q.polish, i + q.offset
+    flow, problem, polish, i = q.flow, q.problem.prepared(), q.polish, i + q.offset
     assert polish is not None  # for the type checker
     noisy, key = i < flow.iterations, jax.random.fold_in(state.key, i)
     guided = jnp.asarray(flow.iterations > 0)

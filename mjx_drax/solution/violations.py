@@ -290,7 +290,8 @@ def measured(
     dtype = family.problem.x_init.dtype
     with family.problem.arithmetic():
         limits = tolerances.of(family.at(0)), tolerances.relative
-        given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+        with np.errstate(over="ignore"):  # what is beyond float32 is infinite
+            given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
         cost, found = _measured(*family.parts, *given)
     size, allowed, entry, knot = (np.asarray(a) for a in found)
 
