@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,8 @@ class Bounds:
             (box.u_lower, -jnp.inf),
             (box.u_upper, jnp.inf),
         )
-        return Box(*(jnp.full_like(end, value) for end, value in ends))
+        free: Any = (jnp.full_like(end, value) for end, value in ends)
+        return Box(*free)
 
     def value(self, box: Box, trajectory: Trajectory) -> Array:
         """b(z) as one term per knot (u_k, x_{k+1}), (K,)."""

@@ -107,8 +107,8 @@ APART = 4e-5
 class Box:
     """Ends of states, (nx,) or (K, nx), and of controls, (nu,) or (K, nu); infinite if free.
 
-    Where x_0 is free, also those of `Trajectory.start`, (n0,). `roomy` is what `with_room` gives, if
-    that is known.
+    Where x_0 is free, also those of `Trajectory.start`, (n0,). `roomy` is what `with_room` gives,
+    if that is known.
     """
 
     x_lower: Array

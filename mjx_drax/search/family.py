@@ -194,10 +194,10 @@ class Family:
     def starts(self, indices: np.ndarray, knots: Trajectory) -> np.ndarray:
         """x_0 of knots (rows, K, ...), as many for each of those problems, (rows, nx)."""
         rows = self.rows(indices, len(knots.x) // len(indices))
-        x = jnp.broadcast_to(rows.x_init, (len(knots.x), rows.dynamics.nx))
+        x = np.broadcast_to(np.asarray(rows.x_init), (len(knots.x), rows.dynamics.nx))
         E = rows.start_map
         if E is None or knots.start is None:
-            return np.asarray(x)
+            return x
         with self.problem.arithmetic():
             return np.asarray(jax.vmap(self.at(0).dynamics.integrate)(x, knots.start @ E.T))
 

@@ -224,7 +224,8 @@ def _trajectory(label: str, arrays: Arrays) -> Trajectory:
 
 
 def _box(label: str, arrays: Arrays) -> Box:
-    return Box(**{k: jnp.asarray(v) for k, v in _within(f"{label}.", arrays).items()})
+    ends: dict[str, Any] = {k: jnp.asarray(v) for k, v in _within(f"{label}.", arrays).items()}
+    return Box(**ends)
 
 
 # The problem
