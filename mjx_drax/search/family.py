@@ -199,7 +199,8 @@ class Family:
         if E is None or knots.start is None:
             return x
         with self.problem.arithmetic():
-            return np.asarray(jax.vmap(self.at(0).dynamics.integrate)(x, knots.start @ E.T))
+            integrate: Any = jax.vmap(self.at(0).dynamics.integrate)
+            return np.asarray(integrate(x, knots.start @ E.T))
 
     def question(
         self,
