@@ -235,7 +235,7 @@ def solve_batch(
     report = reporting(progress, "problems")
     keep_programs()
     family = Family.of(make, values)
-    look_again(family.problem)
+    look_again(family.at(0))
     family = replace(family, problem=family.problem.in_precision(precision))
     with family.problem.arithmetic():
         tolerances = as_tolerances(tolerances)

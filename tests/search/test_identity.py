@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,15 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.tree_util import Partial
 
-from mjx_drax import MPC, from_dynamics, from_program, minimize, register_dataclass, solve
+from mjx_drax import (
+    MPC,
+    from_dynamics,
+    from_program,
+    minimize,
+    register_dataclass,
+    solve,
+    solve_batch,
+)
 from mjx_drax.control.mpc import _planner
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.problem.dynamics import Dynamics
@@ -142,13 +150,17 @@ def test_another_program_has_what_functions_read_by_then():
 
 
 @pytest.mark.slow
-def test_another_motion_has_what_functions_read_by_then():
+@pytest.mark.parametrize("many", [False, True])
+def test_another_motion_has_what_functions_read_by_then(many):
     target = [0.5]
     reach = {"running_cost": lambda x, u: 1e-3 * u @ u + (x[0] - target[0]) ** 2}
     problem = posed(terminal_residual=None, **reach)
     for target[0] in (0.5, -0.5, 0.5):
-        ends = solve(problem, chains=2, progress=False).trajectories.x[:, -1, 0]
-        assert np.allclose(ends, target[0], atol=0.02)
+        if many:
+            ends = solve_batch(lambda x: replace(problem, x_init=x), np.zeros((2, 2)), 2).x[:, -1]
+        else:
+            ends = solve(problem, chains=2, progress=False).trajectories.x[:, -1]
+        assert np.allclose(ends[:, 0], target[0], atol=0.02)
 
 
 def test_rules_of_batches_count():
