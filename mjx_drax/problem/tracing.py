@@ -94,7 +94,8 @@ def _jaxpr(
             way += " on values"
         else:
             given = " and ".join(map(_kind, arguments))
-            way = _missing(function) or f"Change it: it is called with {count}, {given}"
+            missing = _missing(function) if "NoneType" in str(error) else ""
+            way = missing or f"Change it: it is called with {count}, {given}"
         raise DraxError(f"{label} failed when it was traced: {plain(error)}. {way}.") from error
 
 
@@ -157,7 +158,8 @@ def plain(error: Exception) -> str:
         return "it kept a traced value in a global and used it again; remove that"
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return "float(), int() or a shape made of a value; use jax.numpy on arrays"
-    return reason(error).replace("jax.", "").replace("Tracer", "traced value").rstrip(".")
+    text = reason(error).replace("jax.", "").replace("DynamicJaxprTracer", "Tracer")
+    return text.replace("Tracer", "traced value").rstrip(".")
 
 
 def _described(out: Any) -> str:
