@@ -22,6 +22,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.rollout import untraced
+from mjx_drax.search.captured import changed_in_place
 
 _JAXS = {p for p in vars(primitives).values() if isinstance(p, Primitive)}
 """Operations whose rules are JAX's own."""
@@ -51,22 +52,28 @@ def identity(arguments: Any, problem: Problem) -> str | None:
 def look_again(problem: Problem) -> None:
     """Let JAX forget all programs if functions of the problem compute something else than before.
 
-    JAX knows a function by its identity. If a global that it reads has another value now, the
-    programs that were compiled still have the old one.
+    JAX knows a function by its identity. If a global that it reads has another value now, or an
+    array other numbers, the programs that were compiled still have the old ones.
     """
     leaves, tree = jax.tree.flatten(problem)
     kind = _kind(leaves, tree)
     before = _found.pop(kind, None)
+    if changed_in_place(tree):
+        _forget()
     try:
         now = _of_functions(leaves, tree)
     except Exception:  # as in `identity`
         return
     if before not in (None, now):
-        jax.clear_caches()
-        untraced.cache_clear()
+        _forget()
     _found[kind] = now
     if len(_found) > REMEMBERED:
         del _found[next(iter(_found))]
+
+
+def _forget() -> None:
+    jax.clear_caches()
+    untraced.cache_clear()
 
 
 def _kind(leaves: list[Any], tree: Any) -> Any:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,16 @@ from mjx_drax.search.identity import identity, look_again
 from mjx_drax.solution import violations
 
 TABLE = np.linspace(0.0, 1.0, 100_000, dtype=np.float32)
+
+GOAL = np.array([0.5])
+
+
+@dataclass(slots=True)
+class Holder:
+    target: np.ndarray
+
+    def cost(self, x, u):
+        return (x[0] - jnp.asarray(self.target)[0]) ** 2
 
 
 def posed(push=0.1, weight=1.0, table=TABLE, bound=2.0, **changes):
@@ -141,6 +152,31 @@ def test_jax_forgets_programs_only_if_what_functions_read_has_changed():
         assert program(1.0) == pytest.approx(1.0 + target[0])
 
 
+@pytest.mark.parametrize("reached_by", ["closure", "global", "attribute", "partial", "list"])
+def test_arrays_may_be_changed_in_place(reached_by):
+    target = np.array([0.5])  # of 64 bits, so that JAX has a copy
+
+    def reach(target, x, u):
+        return (x[0] - jnp.asarray(target)[0]) ** 2
+
+    holder, listed = Holder(target), [target]
+    costs = {
+        "closure": lambda x, u: reach(target, x, u),
+        "global": lambda x, u: reach(GOAL, x, u),
+        "attribute": holder.cost,
+        "partial": partial(reach, target),
+        "list": lambda x, u: reach(listed[0], x, u),
+    }
+    cost = costs[reached_by]
+    problem = posed(running_cost=cost)
+    program = jax.jit(lambda x: cost(x, x))
+    for goal, known in ((0.5, 0), (0.5, 1), (0.7, 0), (0.7, 1), (0.5, 0)):
+        target[0] = GOAL[0] = goal
+        look_again(problem)
+        assert program._cache_size() == known
+        assert program(jnp.ones(2)) == pytest.approx((1.0 - goal) ** 2)
+
+
 @pytest.mark.slow
 def test_another_program_has_what_functions_read_by_then():
     target = [0.5]
@@ -151,9 +187,12 @@ def test_another_program_has_what_functions_read_by_then():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("many", [False, True])
-def test_another_motion_has_what_functions_read_by_then(many):
-    target = [0.5]
-    reach = {"running_cost": lambda x, u: 1e-3 * u @ u + (x[0] - target[0]) ** 2}
+@pytest.mark.parametrize("target", [[0.5], np.array([0.5])], ids=["list", "array"])
+def test_another_motion_has_what_functions_read_by_then(many, target):
+    def running(x, u):
+        return 1e-3 * u @ u + (x[0] - jnp.asarray(target)[0]) ** 2
+
+    reach = {"running_cost": running}
     problem = posed(terminal_residual=None, **reach)
     for target[0] in (0.5, -0.5, 0.5):
         if many:
