@@ -13,6 +13,7 @@ what was read stays until the next solve looks again (`search.identity`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -56,7 +57,7 @@ def traced(label: str, function: Callable[..., Any], arguments: Arguments) -> ja
         out = function(*values)
         dtype = getattr(out, "dtype", None) if hasattr(out, "shape") else np.result_type(float)
         if dtype is None or not (hasattr(out, "shape") or isinstance(out, float)):
-            way = _missing(function) or "Return one array of floats"
+            way = (_missing(function) if out is None else "") or "Return one array of floats"
             raise DraxError(f"{label} returned {_described(out)}. {way}.")
         if not jnp.issubdtype(dtype, jnp.floating):
             raise DraxError(
@@ -74,7 +75,7 @@ def traced(label: str, function: Callable[..., Any], arguments: Arguments) -> ja
     for index, shape in _out_of_range(first):
         raise DraxError(
             f"{label} reads [{index}] of an array of shape {shape}, which has no such entry, so "
-            "JAX would take another one. Change the index: entries count from 0."
+            "JAX would take another one. Change the index, or clip it: entries count from 0."
         )
     return first.out_avals[0]
 
@@ -89,6 +90,7 @@ def _jaxpr(
         raise
     except Exception as error:
         count = f"{len(arguments)} argument{'s' * (len(arguments) > 1)}"
+        count += " and knot=" * bool(_knot_of(function))
         if isinstance(error, _OF_TRACED):
             way = f"Make it a JAX function of its {count}: jax.numpy, and no Python branches"
             way += " on values"
@@ -111,15 +113,23 @@ _ASKED_BY = {"data": "data=", "parameters": "parameters=", "rate": "rates=1", "j
 
 
 def _missing(function: Any) -> str:
-    """What a function reads of its knot and the problem has not; nothing if that is not known."""
-    knot = getattr(function, "keywords", {}).get("knot")
-    while isinstance(function, Partial):
-        function = function.args[0] if function.args else function.func
-    read = getattr(getattr(function, "__code__", None), "co_names", ())
-    for name, argument in _ASKED_BY.items():
-        if knot is not None and name in read and getattr(knot, name) is None:
-            return f"Give {argument}: without it knot.{name} is None"
-    return ""
+    """What a function may have read of its knot that is None; nothing if it takes no knot."""
+    knot = _knot_of(function)
+    while isinstance(function, partial):  # ours have the user's function as an argument
+        ours = isinstance(function, Partial) and function.args
+        function = function.args[0] if ours else function.func
+    code = getattr(function, "__code__", None)
+    if knot is None and "knot" not in getattr(code, "co_varnames", ()):
+        return ""
+    named = getattr(code, "co_names", ())
+    read = [name for name in _ASKED_BY if name in named] or _ASKED_BY
+    none = [name for name in read if getattr(knot, name, None) is None]
+    asked = " or ".join(f"{_ASKED_BY[name]} for knot.{name}" for name in none)
+    return asked and f"Give {asked}: else it is None"
+
+
+def _knot_of(function: Any) -> Any:
+    return getattr(function, "keywords", {}).get("knot")
 
 
 def _kind(argument: Any) -> str:
@@ -128,24 +138,40 @@ def _kind(argument: Any) -> str:
     return f"a {type(argument).__name__}" if shape is None else f"an array of shape {shape}"
 
 
-def _out_of_range(closed: ClosedJaxpr) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Indices that are the same for all arguments and that an array does not have, and its shape.
+def _out_of_range(closed: ClosedJaxpr) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Reads that are the same for all arguments, of what an array does not have, and its shape.
 
-    Those that it has are read by another operation than these.
+    One number as an index, if the array has it, is read by another operation than these.
     """
     jaxpr = closed.jaxpr
     for equation in jaxpr.eqns:
-        if equation.primitive.name != "dynamic_slice":
+        if equation.primitive.name in ("jit", "pjit"):
+            yield from _out_of_range(equation.params["jaxpr"])
+        if equation.primitive.name == "dynamic_slice":
+            array, *starts = equation.invars
+            read = range(len(starts))
+        elif equation.primitive.name == "gather" and _promised(equation):
+            array, *starts = equation.invars
+            read = equation.params["dimension_numbers"].start_index_map
+        else:
             continue
-        array, *starts = equation.invars
         indices, used = dce_jaxpr(jaxpr.replace(outvars=starts), [True] * len(starts))
         if any(used):
             continue
         found = jax.core.eval_jaxpr(indices, closed.consts)
-        sizes = equation.params["slice_sizes"]
-        for start, size, length in zip(found, sizes, array.aval.shape, strict=True):
-            if not 0 <= int(start) <= length - size:
-                yield int(start) - length * (start < 0), array.aval.shape
+        columns = found if len(found) == len(read) else np.moveaxis(np.asarray(found[0]), -1, 0)
+        shape, sizes = array.aval.shape, equation.params["slice_sizes"]
+        for axis, column in zip(read, columns, strict=True):
+            size, length = sizes[axis], shape[axis]
+            for start in np.ravel(column):
+                if not 0 <= start <= length - size:
+                    first = int(start) - length * int(start < 0)
+                    yield f"{first}:{first + size}" if size > 1 else str(first), shape
+
+
+def _promised(equation: Any) -> bool:
+    """Whether the user has not said what to take in place of entries that are missing."""
+    return equation.params["mode"] == jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
 
 
 def plain(error: Exception) -> str:

@@ -28,12 +28,14 @@ def changed_in_place(functions: Any) -> bool:
     """Whether an array that these functions lead to had other numbers at an earlier call."""
     changed = False
     for array in _arrays(functions):
-        now, key = digest(array), id(array)
+        key, now = id(array), digest(array)
         known, before = _numbers.get(key, (None, now))
-        if known is None or known() is not array:  # the number of one that is gone may come again
-            known, before = weakref.ref(array, lambda _, key=key: _numbers.pop(key, None)), now
+        if known is None or known() is not array:  # another had this id, and is gone
+            known, before = weakref.ref(array), now
         changed |= now != before
         _numbers[key] = known, now
+    for key in [key for key, (known, _) in _numbers.items() if known() is None]:
+        del _numbers[key]
     return changed
 
 

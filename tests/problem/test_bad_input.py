@@ -9,6 +9,7 @@ What the library cannot find out, and so is not here:
 import math
 import random
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -73,6 +74,10 @@ def shouts(*_):
 def solved(**changes):
     """A solve of two chains, of a problem from a function."""
     return solve(point(**changes), 2)
+
+
+def heavy(x, u, knot, factor):
+    return factor * knot.data["mass"] * u @ u
 
 
 def with_cost(l):
@@ -189,11 +194,21 @@ COSTS = [
     ("no-such-entry", lambda at: with_cost(lambda x, u: u[2] ** 2), "reads [2]", "shape (2,)"),
     ("no-such-entry-from-the-end", lambda at: with_cost(lambda x, u: x[-3]), "reads [-3]"),
     ("no-such-column", lambda at: with_cost(lambda x, u: jnp.outer(x, u)[1, 5]), "reads [5]"),
+    ("no-such-entry-of-a-list",
+     lambda at: with_cost(lambda x, u: x[jnp.array([1, 5])].sum()), "reads [5]", "shape (2,)"),
+    ("no-such-entry-when-compiled", lambda at: with_cost(jax.jit(lambda x, u: x[5])), "reads [5]"),
+    ("no-such-slice", lambda at: with_cost(lambda x, u: jax.lax.dynamic_slice(x, (1,), (2,)).sum()),
+     "reads [1:3]", "clip"),
     ("no-rates", lambda at: with_residual(running_residual=lambda x, u, knot: knot.rate),
      "returned None", "rates=1"),
     ("no-data", lambda at: with_cost(lambda x, u, knot: knot.data["mass"] * u @ u), "data="),
     ("no-parameters", lambda at: with_cost(lambda x, u, knot: knot.parameters["mass"] * u @ u),
      "parameters="),
+    ("no-data-through-others", lambda at: with_cost(partial(heavy, factor=2.0)), "data="),
+    ("no-jerk", lambda at: with_residual(running_residual=lambda x, u, knot: knot.jerk, rates=1),
+     "returned None", "rates=2"),
+    ("words-for-a-knot", lambda at: with_cost(lambda x, u, knot: "cheap"), "Return one array"),
+    ("takes-a-knot", lambda at: with_cost(lambda x, u, knot: x @ jnp.zeros(3)), "and knot="),
     ("no-fault-of-the-knot",
      lambda at: with_cost(lambda x, u, knot: knot.data["mass"] if knot.data else x @ jnp.zeros(3)),
      "(3,)", "Change it"),
@@ -335,6 +350,9 @@ ACCEPTED = {
     "where": (lambda x, u: jnp.where(x > 0, x, 0.0).sum(), Restarts()),
     "cond": (lambda x, u: jax.lax.cond(x[0] > 0, jnp.sum, jnp.prod, x), Restarts()),
     "partly": (lambda x, u: jumps(x, u) + u @ u, Restarts()),
+    "ends": (lambda x, u: x[jnp.array([0, -1])] @ x[np.array([-2, 1])] + u[-1] ** 2, Restarts()),
+    "clipped": (lambda x, u: x[jnp.clip(jnp.array([5, -7]), 0, 1)].sum(), Restarts()),
+    "filled": (lambda x, u: x.at[5].get(mode="fill", fill_value=0.0) + u @ u, Restarts()),
     "notes": (noting, Restarts()),
     "callback": (called_back, SAMPLED),
     "jumps": (jumps, SAMPLED),
