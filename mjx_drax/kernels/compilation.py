@@ -18,12 +18,16 @@ from mjx_drax.base.errors import DraxError, reason
 from mjx_drax.kernels import kept
 
 OPTIONS: dict[str, dict[str, str | bool]] = {
-    "gpu": {"xla_gpu_experimental_enable_fusion_autotuner": False},
+    "gpu": {
+        "xla_gpu_experimental_enable_fusion_autotuner": False,
+        "xla_gpu_enable_triton_gemm": False,
+    },
     "cpu": {"xla_backend_optimization_level": "1"},
 }
-"""By backend. On the GPU XLA would try several ways to compile each fusion: up to two thirds of the
-time that a contact model compiles. On the CPU LLVM's full effort takes up to almost three times as
-long (a quadrotor's 103 s, not 37). Solves are as fast without."""
+"""By backend. On the GPU XLA would try several ways to compile each fusion, up to two thirds of the
+time that a contact model compiles, and many kernels for each product of matrices: half of a
+humanoid's 57 s after that. On the CPU LLVM's full effort takes up to almost three times as long (a
+quadrotor's 103 s, not 37). Solves are as fast without."""
 
 
 GRAPH: dict[str, str | bool] = {
@@ -86,11 +90,18 @@ def known_options(graph: bool = False) -> dict[str, str | bool] | None:
     options = OPTIONS.get(backend)
     if graph and backend == "gpu":
         options = OPTIONS["gpu"] | GRAPH
+    if options is None or _known(options):
+        return options
+    return {name: value for name, value in options.items() if _known({name: value})} or None
+
+
+def _known(options: dict[str, str | bool]) -> bool:
+    """Whether the present compiler takes these options."""
     try:
         jax.jit(lambda x: x + 1, compiler_options=options)(0)
     except jax.errors.JaxRuntimeError:
-        return known_options() if graph else None
-    return options
+        return False
+    return True
 
 
 def keep_programs() -> None:

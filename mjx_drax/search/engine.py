@@ -75,7 +75,7 @@ from mjx_drax.search.replayer import Replayer
 from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
 from mjx_drax.search.shooting import Shots, shoot
-from mjx_drax.search.sizes import median, scale_and_floor, sizes_of
+from mjx_drax.search.sizes import Sizes, median, scale_and_floor, sizes_of
 from mjx_drax.search.warm import Warm, warmed
 
 REPORT_EVERY = 20
@@ -268,25 +268,32 @@ class Search:
         self._measure()
 
     def _compile(self, state: State) -> Info:
-        """Compile what iterates; the diagnostics of a chunk's states."""
-        if not self.few:
-            return self._iterated(state, 0, 0)[1]
-        with ThreadPoolExecutor(1) as pool:
-            wide = jnp.result_type(float) == jnp.float64
-            device = jax.config.values["jax_default_device"]
-            second = pool.submit(self._compile_second, state, wide, device)
+        """Compile what iterates and, beside it, more of what is needed; the states' diagnostics."""
+        wide = jnp.result_type(float) == jnp.float64
+        device = jax.config.values["jax_default_device"]
+
+        def here(compile: Callable[[State], object]) -> None:
+            with jax.enable_x64(wide), jax.default_device(device):  # threads do not inherit them
+                compile(state)
+
+        more = [self._sizes] * (self._measured and self.mesh is None)
+        with ThreadPoolExecutor(2) as pool:
+            others = [
+                pool.submit(here, compile)
+                for compile in more + [self._compile_second] * bool(self.few)
+            ]
             _, info = self._iterated(state, 0, 0)
-            second.result()
+            for other in others:
+                other.result()
         return info
 
-    def _compile_second(self, state: State, wide: bool, device: Any) -> None:
+    def _compile_second(self, state: State) -> None:
         """Compile the program for few problems, and what begins and ends with it."""
-        with jax.enable_x64(wide), jax.default_device(device):  # threads do not inherit them
-            knots, keys = self._drawn(0, np.arange(self.few))
-            rows, (shared, own) = np.arange(len(keys)), self.question
-            begin(taken(own, rows), shared, replace(knots, slack=None), keys)
-            nothing = Info.of(np.zeros(len(state.alive)))
-            self._go_on(state, nothing, rows, 0, 0)
+        knots, keys = self._drawn(0, np.arange(self.few))
+        rows, (shared, own) = np.arange(len(keys)), self.question
+        begin(taken(own, rows), shared, replace(knots, slack=None), keys)
+        nothing = Info.of(np.zeros(len(state.alive)))
+        self._go_on(state, nothing, rows, 0, 0)
 
     def _compile_more(self, kept: Chains) -> None:
         """Compile for the places of later attempts, once one is made and if they are more."""
@@ -348,16 +355,25 @@ class Search:
     def _measure(self) -> None:
         """The scale and the floor of costs of the chunk's problems, from their initial knots."""
         stage, indices = self.stage, self.indices
-        if self.settings.descent is None and self.settings.attempts == 1:
-            return  # the schedules have a scale of their own, and no costs are compared
-        shared, own = self.question
-        knots = gathered(stage.now.state.trajectory, self.mesh)
-        sizes = jax.tree.map(np.asarray, sizes_of(own, shared, replace(knots, slack=None)))
+        if not self._measured:
+            return
+        sizes = jax.tree.map(np.asarray, self._sizes(stage.now.state))
         of_problem = jax.tree.map(lambda a: a.reshape(len(indices), -1), sizes)
         scale, floor = stage.cost_scale.copy(), stage.floor.copy()
         scale[indices], floor[indices] = scale_and_floor(of_problem, self.polish is not None)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
         self._settle(0, False, indices, scale)
+
+    @property
+    def _measured(self) -> bool:
+        """Whether costs are compared, or the schedules are in scales that are measured."""
+        return self.settings.descent is not None or self.settings.attempts > 1
+
+    def _sizes(self, state: State) -> Sizes:
+        """Of every row."""
+        shared, own = self.question
+        knots = gathered(state.trajectory, self.mesh)
+        return sizes_of(own, shared, replace(knots, slack=None))
 
     def _next_chunk(self) -> None:
         """Keep the best of the chunk, and go on to the next one."""

@@ -56,6 +56,15 @@ def test_a_program_that_is_waited_for_becomes_a_graph_on_gpus(monkeypatch):
     assert compilation.known_options(graph=True) == compilation.OPTIONS["gpu"]
 
 
+def test_an_option_that_is_not_known_leaves_the_others(monkeypatch):
+    usual = dict(compilation.OPTIONS["cpu"])
+    monkeypatch.setitem(compilation.OPTIONS["cpu"], "xla_no_such_option", True)
+    assert compilation.known_options() == usual
+    compilation.known_options.cache_clear()
+    monkeypatch.setitem(compilation.OPTIONS, "cpu", {"xla_no_such_option": True})
+    assert compilation.known_options() is None
+
+
 def test_garbage_is_looked_for_less_often_for_a_while():
     usual = gc.get_threshold()
     seen = []
