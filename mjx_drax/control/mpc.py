@@ -308,13 +308,15 @@ class MPC:
     def reset(self, x: ArrayLike, t: float = 0.0) -> Plan:
         """Solve from x (nx,) as `solve` does, and make that the plan at time t [s].
 
-        Everything that later plans need is compiled here too.
+        Everything that later plans need is compiled here too. A state that was measured outside of
+        its bounds is solved from the nearest one inside.
 
         Raises:
             DraxError: x does not fit the problem, or is not finite; nor is t.
         """
         _require_time(t)
-        problem = self.problem.with_x_init(x).at_time(t)
+        look_again(self.problem)
+        problem = self.problem.with_x_init(self._inside(x)).at_time(t)
         self._begin(t)
         clock = time.perf_counter()
         found = Search(Family.of_one(problem), self.chains, self.seed, self.solver).run()
@@ -466,6 +468,12 @@ class MPC:
         if state.shape != (nx,):
             raise DraxError(f"the state x has shape {state.shape}: give {nx} numbers, ({nx},).")
         return state
+
+    def _inside(self, x: ArrayLike) -> np.ndarray:
+        """A state (nx,) in its bounds."""
+        state, bounds = self._state(x), self.problem.bounds
+        lower, upper = (np.asarray(end)[: len(state)] for end in (bounds.x_lower, bounds.x_upper))
+        return np.clip(state, lower, upper)
 
     def _between(self, x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
         """The state (nx,) a share of the way from x to y, on the host."""

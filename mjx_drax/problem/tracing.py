@@ -40,6 +40,11 @@ def require_shape(
 ) -> None:
     """Trace a function abstractly; complain if it fails or returns another shape."""
     seen = traced(label, function, arguments).shape
+    if shape is None and 0 in seen:
+        raise DraxError(
+            f"{label} returned shape {seen}, no numbers at all: return at least one, or leave it "
+            "out; a slice beyond the end of an array is empty."
+        )
     if shape is not None and seen != shape:
         expected = "a scalar" if shape == () else f"shape {shape}"
         hint = " (a vector cost goes in as a residual)" if shape == () else ""

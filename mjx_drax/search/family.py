@@ -130,8 +130,8 @@ class Family:
                 ours = isinstance(error, DraxError)
                 words = "what it builds takes numbers, not traced values" if ours else plain(error)
                 raise DraxError(
-                    f"make failed when it was traced: {words}. Make it a JAX function, "
-                    "such as lambda x: dataclasses.replace(problem, x_init=x)."
+                    f"make failed when it was traced: {words}. Let it change numbers of a problem "
+                    "built outside of it, by JAX: lambda x: dataclasses.replace(problem, x_init=x)."
                 ) from error
             tree.append(structure)
             return [jnp.asarray(a) for a, d in zip(found, differs, strict=True) if d]

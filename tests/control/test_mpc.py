@@ -98,6 +98,39 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
 
 
 @pytest.mark.slow
+def test_a_plan_may_begin_beyond_a_bound():
+    policy = MPC(balance(x_bounds=([-1.0, -2.0], [0.6, 2.0])), chains=2, explorers=0, solver=FAST)
+    measured = np.array([0.63, 0.0])
+    policy(measured, 0.0)
+    np.testing.assert_allclose(policy.latest.x[0], measured, rtol=1e-6)
+    assert policy.statistics.failed == 0
+    assert policy.latest.x[1:, 0].max() < 0.63
+
+
+@pytest.mark.slow
+def test_a_reset_has_what_functions_read_by_then():
+    aim = np.array([0.5])
+    policy = MPC(
+        from_function(
+            lambda x, u: x + DT * u,
+            x_init=[0.0],
+            nu=1,
+            dt=DT,
+            horizon=K * DT,
+            running_residual=lambda x, u: 0.1 * u,
+            terminal_residual=lambda x: 10.0 * (x - jnp.asarray(aim)),
+        ),
+        chains=2,
+        explorers=0,
+        solver=FAST,
+    )
+    for aim[0] in (0.5, -0.5):
+        policy.reset([0.0])
+        assert policy.latest.x[-1] == pytest.approx(aim, abs=0.02)
+        assert policy.plan([0.0], DT).x[-1] == pytest.approx(aim, abs=0.02)
+
+
+@pytest.mark.slow
 def test_float64_stays_float64():
     with jax.enable_x64(True):
         policy = MPC(balance(), chains=2, explorers=1, hold=1.0, solver=FAST)
