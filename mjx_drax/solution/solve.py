@@ -29,7 +29,7 @@ from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
-from mjx_drax.solution.violations import Tolerances, as_tolerances
+from mjx_drax.solution.violations import Tolerances, as_tolerances, warn_of_loose_ends
 
 
 def solve(
@@ -156,6 +156,7 @@ def _certified(
     family, plan = Family.of_one(problem), np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
     open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
+    warn_of_loose_ends(family, plan, u, tolerances)
     return Solution(
         problem=problem,
         solver=settings,

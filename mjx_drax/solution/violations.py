@@ -20,6 +20,7 @@ could mend it. A stage constraint is one of (x_k, u_k), k = 0..K-1, and x_0 is g
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -30,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.base.errors import DraxError, require_not_negative, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, require_not_negative, shown
 from mjx_drax.base.numbers import numbers
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.kernels.linalg import full_precision
@@ -60,6 +61,9 @@ STILL = 1e-2
 
 WIDE = 10.0
 """A box that is wider than so many times the motion's extent counts as that wide."""
+
+NOTHING, LOOSE = 1e-3, 4.0
+"""What x_init lacks at the end, in multiples of what is tolerated: nothing, or little, below."""
 
 MOVE, DIRECTIONS = 1e-2, 16
 """Share of the extent by which knots are moved to see how constraints change, and how often."""
@@ -269,6 +273,31 @@ def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
     with np.errstate(invalid="ignore"):  # of plans that are not finite
         knots_last = (np.asarray(a, float).swapaxes(1, 2).copy() for a in (plan, moved, u))
         return tuple(np.nan_to_num(np.ptp(a, axis=2), posinf=0.0) for a in knots_last)
+
+
+def warn_of_loose_ends(
+    family: Family, plan: np.ndarray, u: np.ndarray, tolerances: Tolerances
+) -> None:
+    """Warn of constraints at the end that tolerate much of what x_init lacks.
+
+    The plans and their controls are those that were replayed: their sizes are compiled for.
+    """
+    end = family.problem.terminal_constraint
+    if end.rows == 0:
+        return
+    still = np.repeat(plan[:, :1], plan.shape[1], axis=1), u
+    off = np.zeros((len(plan), family.problem.dynamics.ndx))
+    _, found = measured(family, still, off, extents(family.problem, plan, u), tolerances)
+    for violation in found.of(0):
+        if violation.kind.startswith("terminal") and NOTHING < violation.ratio < LOOSE:
+            warnings.warn(
+                f"x_init is off the {words(violation.kind)} by {violation.size:.1e} only, and "
+                f"{violation.allowed:.1e} is tolerated, so its certificate says little: give "
+                f"tolerances=Tolerances({violation.kind}=...), or an x_scatter as wide as the "
+                "motion.",
+                DraxWarning,
+                stacklevel=4,
+            )
 
 
 def measured(

@@ -1,6 +1,7 @@
 """What a replay breaks: how much, which entry, at which knot; what is tolerated, in any units."""
 
 import json
+import warnings
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -21,10 +22,11 @@ from mjx_drax import (
     solve_batch,
 )
 from mjx_drax.problem.problem import Problem
+from mjx_drax.search.family import Family
 from mjx_drax.solution.program import from_program
 from mjx_drax.solution.replay import open_loop_is_better, replays
 from mjx_drax.solution.report import lines
-from mjx_drax.solution.violations import KINDS
+from mjx_drax.solution.violations import KINDS, warn_of_loose_ends
 from mjx_drax.view import plotting
 from mjx_drax.view.video import outcome_lines
 
@@ -383,3 +385,19 @@ def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
     assert not found.optimal.any()
     strict = replace(found, chain_residual=np.zeros_like(found.chain_residual))
     np.testing.assert_array_equal(strict.optimal, found.certified)
+
+
+@pytest.mark.parametrize(
+    ("place", "tolerated", "warned"),
+    [(1e-4, None, True), (0.1, None, False), (0.1, 0.09, True), (1e-4, 1e-6, False), (0, 1, False)],
+    ids=["short", "far", "far-but-tolerated", "short-but-strict", "stays"],
+)
+def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, warned):
+    at_rest = mass(terminal_equality=lambda x: x - jnp.array([place, 0.0]))
+    x, u = motion(2.5 * place)
+    given = Family.of_one(at_rest), x[None], u[None], Tolerances(terminal_equality=tolerated)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        warn_of_loose_ends(*given)
+    told = [f"off the terminal equality by {place:.1e}" in str(w.message) for w in found]
+    assert told == [True] * warned
