@@ -558,11 +558,12 @@ def checked(problem: Problem) -> Problem:
 def _check_bounds(problem: Problem, start: np.ndarray) -> None:
     """The part of `checked` for bounds, the box of initial knots, and x_init (nx,) in them."""
     dynamics, bounds, scatter = problem.dynamics, problem.bounds, problem.scatter
+    u = "u" if dynamics.nx else "x"  # of a program
     for label, size, ends in (
         ("x", dynamics.nx, (bounds.x_lower, bounds.x_upper)),
-        ("u", dynamics.nu, (bounds.u_lower, bounds.u_upper)),
+        (u, dynamics.nu, (bounds.u_lower, bounds.u_upper)),
         ("scatter of x", dynamics.nx, (scatter.x_lower, scatter.x_upper)),
-        ("scatter of u", dynamics.nu, (scatter.u_lower, scatter.u_upper)),
+        (f"scatter of {u}", dynamics.nu, (scatter.u_lower, scatter.u_upper)),
     ):
         for end in ends:
             if np.shape(end) not in ((size,), (problem.horizon, size)):

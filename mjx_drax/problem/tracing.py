@@ -167,11 +167,10 @@ def _out_of_range(closed: ClosedJaxpr) -> Iterator[tuple[str, tuple[int, ...]]]:
         columns = found if len(found) == len(read) else np.moveaxis(np.asarray(found[0]), -1, 0)
         shape, sizes = array.aval.shape, equation.params["slice_sizes"]
         for axis, column in zip(read, columns, strict=True):
-            size, length = sizes[axis], shape[axis]
-            for start in np.ravel(column):
-                if not 0 <= start <= length - size:
-                    first = int(start) - length * int(start < 0)
-                    yield f"{first}:{first + size}" if size > 1 else str(first), shape
+            size, length, starts = sizes[axis], shape[axis], np.ravel(column)
+            for start in starts[(starts < 0) | (starts > length - size)]:
+                first = int(start) - length * int(start < 0)
+                yield f"{first}:{first + size}" if size > 1 else str(first), shape
 
 
 def _promised(equation: Any) -> bool:

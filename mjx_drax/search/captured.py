@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Iterator
+from dataclasses import dataclass
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any
 
@@ -21,22 +22,42 @@ REACHED = 10_000
 """Objects that are looked through at most."""
 
 _LIBRARIES = ("jax", "jaxlib", "mjx_drax", "mujoco", "numpy")
-_numbers: dict[int, tuple[weakref.ref[np.ndarray], str]] = {}
 
 
-def changed_in_place(functions: Any) -> bool:
-    """Whether an array that these functions lead to had other numbers at an earlier call."""
-    changed = False
+@dataclass
+class _Known:
+    """An array, the digest of its numbers, and the functions that lead to it and do not read it."""
+
+    array: weakref.ref[np.ndarray]
+    numbers: str
+    unread_by: set[Any]
+
+
+_known: dict[int, _Known] = {}
+
+
+def changed_in_place(functions: Any) -> list[int]:
+    """Identities of arrays that functions, hashable, lead to, and whose numbers were others before.
+
+    They count as known from now on. Those that the functions do `not_read` are left out.
+    """
+    for key in [key for key, known in _known.items() if known.array() is None]:
+        del _known[key]  # another array may get its identity
+    changed = []
     for array in _arrays(functions):
-        key, now = id(array), digest(array)
-        known, before = _numbers.get(key, (None, now))
-        if known is None or known() is not array:  # another had this id, and is gone
-            known, before = weakref.ref(array), now
-        changed |= now != before
-        _numbers[key] = known, now
-    for key in [key for key, (known, _) in _numbers.items() if known() is None]:
-        del _numbers[key]
+        known = _known.get(id(array))
+        if known is None:
+            _known[id(array)] = _Known(weakref.ref(array), digest(array), set())
+        elif functions not in known.unread_by:
+            before, known.numbers = known.numbers, digest(array)
+            changed += [id(array)] * (known.numbers != before)
     return changed
+
+
+def not_read(functions: Any, arrays: list[int]) -> None:
+    """Count changes of these arrays no more: what the functions compute does not depend on them."""
+    for key in arrays:
+        _known[key].unread_by.add(functions)
 
 
 def _arrays(root: Any) -> Iterator[np.ndarray]:

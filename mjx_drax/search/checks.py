@@ -191,13 +191,14 @@ def require_sound(
     finite, constraints = _finite(problem, stages, end, _in_forward(flow, problem), with_f)
     for label, what, good in _by_function(problem, finite):
         if not good.any():
-            at = "the initial points"
+            at, move = "the initial points", "the scatter of initial points"
             if problem.dynamics.nx:
                 at = "the last initial state" if label.startswith("terminal") else "x_init"
+                move = "x_init or the scatter of initial knots"
             raise DraxError(
                 f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
                 "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
-                "move x_init or the scatter of initial knots."
+                f"move {move}."
             )
     if alone and problem.start_map is None:
         u = np.asarray(stages)[:, 0, problem.dynamics.nx :]

@@ -22,7 +22,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.rollout import untraced
-from mjx_drax.search.captured import changed_in_place
+from mjx_drax.search.captured import changed_in_place, not_read
 
 _JAXS = {p for p in vars(primitives).values() if isinstance(p, Primitive)}
 """Operations whose rules are JAX's own."""
@@ -58,13 +58,16 @@ def look_again(problem: Problem) -> None:
     leaves, tree = jax.tree.flatten(problem)
     kind = _kind(leaves, tree)
     before = _found.pop(kind, None)
-    if changed_in_place(tree):
+    changed = changed_in_place(tree)
+    if changed:
         _forget()
     try:
         now = _of_functions(leaves, tree)
     except Exception:  # as in `identity`
         return
-    if before not in (None, now):
+    if before == now:
+        not_read(tree, changed)
+    elif before is not None:
         _forget()
     _found[kind] = now
     if len(_found) > REMEMBERED:

@@ -26,6 +26,7 @@ from mjx_drax import (
     Smoothed,
     Trajectory,
     from_program,
+    minimize,
     solve,
 )
 from mjx_drax.search.restarts import settled
@@ -199,6 +200,10 @@ COSTS = [
     ("no-such-entry-when-compiled", lambda at: with_cost(jax.jit(lambda x, u: x[5])), "reads [5]"),
     ("no-such-slice", lambda at: with_cost(lambda x, u: jax.lax.dynamic_slice(x, (1,), (2,)).sum()),
      "reads [1:3]", "clip"),
+    ("program-bounds-cross",
+     lambda at: from_program(2, cost=lambda x: x @ x, bounds=([1, 1], [0, 2])), "of x cross"),
+    ("program-not-finite", lambda at: minimize(from_program(2, cost=lambda x: jnp.log(-x @ x))),
+     "move the scatter of initial points"),
     ("empty-slice", lambda at: point(terminal_residual=lambda x: x[3:4] - 0.1),
      "terminal_residual returned shape (0,)", "slice"),
     ("no-rows", lambda at: point(equality=lambda x, u: u[5:]), "equality returned shape (0,)"),

@@ -177,6 +177,22 @@ def test_arrays_may_be_changed_in_place(reached_by):
         assert program(jnp.ones(2)) == pytest.approx((1.0 - goal) ** 2)
 
 
+def test_arrays_that_no_function_reads_cost_one_compilation_at_most():
+    logged = {"aim": Holder(np.array([0.5])), "log": np.zeros(3)}
+    problem = posed(running_cost=lambda x, u: logged["aim"].cost(x, u))
+    another = posed(running_cost=lambda x, u: x @ x + jnp.asarray(logged["log"])[0])
+    program = jax.jit(lambda x: x + jnp.asarray(logged["log"]))
+    for step, known in enumerate((0, 0, 1, 1)):
+        logged["log"][0] = 1.0 + step
+        look_again(problem)
+        assert program._cache_size() == known
+        program(1.0)
+    for logged["log"][0], known in ((7.0, 0), (7.0, 1), (8.0, 0)):  # which others may read
+        look_again(another)
+        assert program._cache_size() == known
+        assert program(1.0)[0] == 1.0 + logged["log"][0]
+
+
 @pytest.mark.slow
 def test_another_program_has_what_functions_read_by_then():
     target = [0.5]
