@@ -52,7 +52,7 @@ from mjx_drax.base.errors import (
     require_whole,
     shown,
 )
-from mjx_drax.base.numbers import numbers
+from mjx_drax.base.numbers import numbers, vector
 from mjx_drax.base.pytrees import packed, register_dataclass, unpacked
 from mjx_drax.control.open_quantities import (
     Applied,
@@ -92,6 +92,9 @@ CHEAPER = 0.9
 
 ENDLESS = 10**6
 """Iterations of the polish, of which none is the last one."""
+
+BEYOND = 0.1
+"""How far outside of its bounds a measured state may be, as a share of their width."""
 
 HEATED, CYCLE = 30, 50
 """Iterations of an explorer with noise, and of all, before it starts again."""
@@ -308,8 +311,8 @@ class MPC:
     def reset(self, x: ArrayLike, t: float = 0.0) -> Plan:
         """Solve from x (nx,) as `solve` does, and make that the plan at time t [s].
 
-        Everything that later plans need is compiled here too. A state that was measured outside of
-        its bounds is solved from the nearest one inside.
+        Everything that later plans need is compiled here too. A state that was measured beyond a
+        bound, by up to a tenth of the bounds' width, is solved from that bound.
 
         Raises:
             DraxError: x does not fit the problem, or is not finite; nor is t.
@@ -469,11 +472,14 @@ class MPC:
             raise DraxError(f"the state x has shape {state.shape}: give {nx} numbers, ({nx},).")
         return state
 
-    def _inside(self, x: ArrayLike) -> np.ndarray:
-        """A state (nx,) in its bounds."""
-        state, bounds = self._state(x), self.problem.bounds
-        lower, upper = (np.asarray(end)[: len(state)] for end in (bounds.x_lower, bounds.x_upper))
-        return np.clip(state, lower, upper)
+    def _inside(self, x: ArrayLike) -> Array:
+        """x moved into its bounds, unless it is no state (nx,) near them: that is to be refused."""
+        state, bounds, nx = vector("x_init", x), self.problem.bounds, self.problem.dynamics.given_nx
+        if len(state) != nx:
+            return state
+        lower, upper = bounds.x_lower[:nx], bounds.x_upper[:nx]
+        near = jnp.maximum(lower - state, state - upper) <= BEYOND * (upper - lower)
+        return jnp.where(near, jnp.clip(state, lower, upper), state)
 
     def _between(self, x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
         """The state (nx,) a share of the way from x to y, on the host."""
