@@ -815,17 +815,17 @@ class Search:
         better = np.zeros(len(now.missed), bool)
         if self.guess is not None and stage.attempt == stage.rollouts == 0:
             # The attempt may have lost contacts of the guess: rollouts then start from the guess
-            guessed = self._replayer.rolled_out(self._guessed(), 0.0, stage.done)
+            everyone = np.arange(len(better))
+            guessed = self._replayer.rolled_out(self._guessed(), everyone, 0.0, stage.done)
             now, better = self._no_worse(now, guessed)
         damping, count = stage.damping, stage.rollouts
-        if (
-            count == 0
-            and not better.any()
-            and now.feasible.all()
-            and not self._replayer.missed(now).any()
-        ):
-            # Rounds are for what random shooting changes
-            damping, count = np.full_like(damping, np.inf), self._without_more_rounds(now)
+        if count == 0 and not better.any():
+            # Where all chains of a problem are sound, rounds are for what random shooting changes
+            sound = now.feasible & ~self._replayer.missed(now)
+            whole = sound.reshape(len(self.indices), -1).all(axis=1)
+            damping = np.where(np.repeat(whole, len(sound) // len(whole)), np.inf, damping)
+            if whole.all():
+                count = self._without_more_rounds(now)
             if count == rollouts.total:
                 return True
         try:
@@ -892,7 +892,8 @@ class Search:
     def _next_rollout(self) -> None:
         """A rollout without feedback, later ones with it."""
         stage = self.stage
-        now = self._replayer.rolled_out(stage.now, float(stage.rollouts > 0), stage.done)
+        rows, with_feedback = np.flatnonzero(np.isfinite(stage.damping)), float(stage.rollouts > 0)
+        now = self._replayer.rolled_out(stage.now, rows, with_feedback, stage.done)
         self.stage = replace(stage, now=now, rollouts=stage.rollouts + 1)
 
     def _next_round(self) -> None:

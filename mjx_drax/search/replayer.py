@@ -86,9 +86,17 @@ class Replayer:
             missed[rows] = ~self.family.reached(plans)[which]
         return missed
 
-    def rolled_out(self, chains: Chains, with_feedback: float, done: int) -> Chains:
-        """The best of chains and of their rollouts."""
-        return self._better(chains, np.arange(len(self.floor)), with_feedback, done)
+    def rolled_out(
+        self, chains: Chains, rows: np.ndarray, with_feedback: float, done: int
+    ) -> Chains:
+        """The chains, and of `rows` the best of them and of their rollouts."""
+        found, everyone = (
+            self._better(chains, rows, with_feedback, done),
+            np.arange(len(self.floor)),
+        )
+        if len(rows) == len(everyone):
+            return found
+        return best_of(_only(chains, np.setdiff1d(everyone, rows)), found, everyone)
 
     def rolled_out_in_part(
         self, now: Chains, whole: Chains, rows: np.ndarray, done: int
