@@ -26,38 +26,53 @@ _LIBRARIES = ("jax", "jaxlib", "mjx_drax", "mujoco", "numpy")
 
 @dataclass
 class _Known:
-    """An array, the digest of its numbers, and the functions that lead to it and do not read it."""
+    """An array, digests of its numbers, and the functions that lead to it and do not read it.
+
+    The digests are of the numbers as they are, and as float32 has them.
+    """
 
     array: weakref.ref[np.ndarray]
-    numbers: str
+    numbers: tuple[str, str]
     unread_by: set[Any]
 
 
 _known: dict[int, _Known] = {}
 
 
-def changed_in_place(functions: Any) -> list[int]:
+def changed_in_place(functions: Any) -> dict[int, bool]:
     """Identities of arrays that functions, hashable, lead to, and whose numbers were others before.
 
-    They count as known from now on. Those that the functions do `not_read` are left out.
+    And whether float32 shows the change. The numbers count as known from now on. Arrays that the
+    functions do `not_read` are left out.
     """
     for key in [key for key, known in _known.items() if known.array() is None]:
         del _known[key]  # another array may get its identity
-    changed = []
+    changed = {}
     for array in _arrays(functions):
         known = _known.get(id(array))
         if known is None:
-            _known[id(array)] = _Known(weakref.ref(array), digest(array), set())
+            _known[id(array)] = _Known(weakref.ref(array), _digests(array), set())
         elif functions not in known.unread_by:
-            before, known.numbers = known.numbers, digest(array)
-            changed += [id(array)] * (known.numbers != before)
+            before, known.numbers = known.numbers, _digests(array)
+            if known.numbers != before:
+                changed[id(array)] = known.numbers[1] != before[1]
     return changed
 
 
-def not_read(functions: Any, arrays: list[int]) -> None:
-    """Count changes of these arrays no more: what the functions compute does not depend on them."""
-    for key in arrays:
-        _known[key].unread_by.add(functions)
+def not_read(functions: Any, changed: dict[int, bool]) -> None:
+    """Look at these arrays no more: what the functions compute did not depend on their change.
+
+    Those whose change float32 does not show may well be read.
+    """
+    for key, shown in changed.items():
+        if shown:
+            _known[key].unread_by.add(functions)
+
+
+def _digests(array: np.ndarray) -> tuple[str, str]:
+    with np.errstate(over="ignore"):
+        rounded = array.astype(np.float32) if array.dtype == np.float64 else array
+    return digest(array), digest(rounded)
 
 
 def _arrays(root: Any) -> Iterator[np.ndarray]:

@@ -177,6 +177,15 @@ def test_arrays_may_be_changed_in_place(reached_by):
         assert program(jnp.ones(2)) == pytest.approx((1.0 - goal) ** 2)
 
 
+def test_a_change_that_float32_does_not_show_hides_no_later_one():
+    target = np.array([0.5])
+    problem = posed(running_cost=lambda x, u: (x[0] - jnp.asarray(target)[0]) ** 2)
+    program = jax.jit(lambda x: x - jnp.asarray(target))
+    for target[0] in (0.5, 0.5 + 1e-12, 0.7):
+        look_again(problem)
+        assert program(1.0)[0] == pytest.approx(1.0 - target[0])
+
+
 def test_arrays_that_no_function_reads_cost_one_compilation_at_most():
     logged = {"aim": Holder(np.array([0.5])), "log": np.zeros(3)}
     problem = posed(running_cost=lambda x, u: logged["aim"].cost(x, u))
