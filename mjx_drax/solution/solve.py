@@ -156,8 +156,7 @@ def _certified(
     family, plan = Family.of_one(problem), np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
     open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
-    warn_of_loose_ends(family, plan, u, tolerances)
-    return Solution(
+    solution = Solution(
         problem=problem,
         solver=settings,
         seed=seed,
@@ -183,3 +182,6 @@ def _certified(
         solve_time=found.solve_time,
         engine=problem.dynamics.engine,
     )
+    if solution.certified:
+        warn_of_loose_ends(family, plan, u, tolerances, solution.best_chain)
+    return solution

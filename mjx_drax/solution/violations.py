@@ -276,11 +276,14 @@ def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
 
 
 def warn_of_loose_ends(
-    family: Family, plan: np.ndarray, u: np.ndarray, tolerances: Tolerances
+    family: Family, plan: np.ndarray, u: np.ndarray, tolerances: Tolerances, certified: int
 ) -> None:
     """Warn of constraints at the end that tolerate much of what x_init lacks.
 
-    The plans and their controls are those that were replayed: their sizes are compiled for.
+    Args:
+        plan, u: all plans that were replayed, x_0..x_K (n, K + 1, nx), and their controls
+            (n, K, nu): `measured` is compiled for as many.
+        certified: the plan whose certificate counts.
     """
     end = family.problem.terminal_constraint
     if end.rows == 0:
@@ -288,7 +291,7 @@ def warn_of_loose_ends(
     still = np.repeat(plan[:, :1], plan.shape[1], axis=1), u
     off = np.zeros((len(plan), family.problem.dynamics.ndx))
     _, found = measured(family, still, off, extents(family.problem, plan, u), tolerances)
-    for violation in found.of(0):
+    for violation in found.of(certified):
         if violation.kind.startswith("terminal") and NOTHING < violation.ratio < LOOSE:
             warnings.warn(
                 f"x_init is off the {words(violation.kind)} by {violation.size:.1e} only, and "

@@ -395,7 +395,8 @@ def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
 def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, warned):
     at_rest = mass(terminal_equality=lambda x: x - jnp.array([place, 0.0]))
     x, u = motion(2.5 * place)
-    given = Family.of_one(at_rest), x[None], u[None], Tolerances(terminal_equality=tolerated)
+    wild = np.stack([1e4 * x, x]), np.stack([1e4 * u, u])  # a plan that is not certified, and one
+    given = Family.of_one(at_rest), *wild, Tolerances(terminal_equality=tolerated), 1
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         warn_of_loose_ends(*given)
