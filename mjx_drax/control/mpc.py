@@ -94,7 +94,8 @@ ENDLESS = 10**6
 """Iterations of the polish, of which none is the last one."""
 
 BEYOND = 0.1
-"""How far outside of its bounds a measured state may be, as a share of their width."""
+"""How far outside of its bounds a measured state may be, as a share of their width, or of that of
+the box of initial knots if it is less."""
 
 HEATED, CYCLE = 30, 50
 """Iterations of an explorer with noise, and of all, before it starts again."""
@@ -311,8 +312,8 @@ class MPC:
     def reset(self, x: ArrayLike, t: float = 0.0) -> Plan:
         """Solve from x (nx,) as `solve` does, and make that the plan at time t [s].
 
-        Everything that later plans need is compiled here too. A state that was measured beyond a
-        bound, by up to a tenth of the bounds' width, is solved from that bound.
+        Everything that later plans need is compiled here too. A state that was measured a
+        little beyond a bound (`BEYOND`) is solved from that bound.
 
         Raises:
             DraxError: x does not fit the problem, or is not finite; nor is t.
@@ -477,8 +478,10 @@ class MPC:
         state, bounds, nx = vector("x_init", x), self.problem.bounds, self.problem.dynamics.given_nx
         if len(state) != nx:
             return state
-        lower, upper = bounds.x_lower[:nx], bounds.x_upper[:nx]
-        near = jnp.maximum(lower - state, state - upper) <= BEYOND * (upper - lower)
+        lower, upper, box = bounds.x_lower[:nx], bounds.x_upper[:nx], self.problem.scatter
+        scattered = jnp.atleast_2d(box.x_upper - box.x_lower).max(axis=0)[:nx]
+        width = jnp.minimum(upper - lower, scattered)  # a bound may have one side alone
+        near = jnp.maximum(lower - state, state - upper) <= BEYOND * width
         return jnp.where(near, jnp.clip(state, lower, upper), state)
 
     def _between(self, x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:

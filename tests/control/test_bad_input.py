@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from builders import NAN, At, arm, assert_complains, cases, parts, point
+from builders import INF, NAN, At, arm, assert_complains, cases, parts, point
 
 from mjx_drax import MPC, Background, Identity, Langevin, Plant, Push
 from mjx_drax.control.trials import simulate
@@ -45,6 +45,8 @@ LOOPS = [
     ("mpc-reset-shape", lambda at: MPC(at.robot).reset([0.0]), "x_init has shape (1,)"),
     ("mpc-reset-nan", lambda at: MPC(at.robot).reset([0.0, NAN]), "x_init is [0.0, nan]"),
     ("mpc-reset-outside", lambda at: MPC(at.robot).reset([9.0, 0.0]), "outside the bounds"),
+    ("mpc-reset-outside-one-side",
+     lambda at: MPC(point(x_bounds=(-1.0, INF))).reset([-9.0, 0.0]), "outside the bounds"),
     ("mpc-reset-time", lambda at: MPC(at.robot).reset([0.0, 0.0], "now"), "time t is 'now'"),
     ("mpc-plan-shape", lambda at: at.policy.plan(np.zeros(3), 0.0),
      "state x has shape (3,)", "2"),
