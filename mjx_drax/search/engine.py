@@ -272,16 +272,17 @@ class Search:
         wide = jnp.result_type(float) == jnp.float64
         device = jax.config.values["jax_default_device"]
 
-        def here(compile: Callable[[State], object]) -> None:
+        def here(work: Callable[[State], object]) -> None:
             with jax.enable_x64(wide), jax.default_device(device):  # threads do not inherit them
-                compile(state)
+                work(state)
 
-        more = [self._sizes] * (self._measured and self.mesh is None)
+        more: list[Callable[[State], object]] = []
+        if self._measured and self.mesh is None:
+            more.append(self._sizes)
+        if self.few:
+            more.append(self._compile_second)
         with ThreadPoolExecutor(2) as pool:
-            others = [
-                pool.submit(here, compile)
-                for compile in more + [self._compile_second] * bool(self.few)
-            ]
+            others = [pool.submit(here, work) for work in more]
             _, info = self._iterated(state, 0, 0)
             for other in others:
                 other.result()

@@ -90,10 +90,8 @@ class Replayer:
         self, chains: Chains, rows: np.ndarray, with_feedback: float, done: int
     ) -> Chains:
         """The chains, and of `rows` the best of them and of their rollouts."""
-        found, everyone = (
-            self._better(chains, rows, with_feedback, done),
-            np.arange(len(self.floor)),
-        )
+        everyone = np.arange(len(self.floor))
+        found = self._better(chains, rows, with_feedback, done)
         if len(rows) == len(everyone):
             return found
         return best_of(_only(chains, np.setdiff1d(everyone, rows)), found, everyone)
