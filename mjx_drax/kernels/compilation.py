@@ -5,7 +5,9 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cached_property, lru_cache, update_wrapper
 from inspect import Signature, signature
 from pathlib import Path
@@ -16,6 +18,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_drax.base.errors import DraxError, reason
 from mjx_drax.kernels import kept
+from mjx_drax.kernels.batching import on_gpu
 
 OPTIONS: dict[str, dict[str, str | bool]] = {
     "gpu": {
@@ -155,6 +158,37 @@ def said_plainly(what: str, hint: str = "with fewer chains") -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def while_compiling(*works: Callable[[], object]) -> Iterator[None]:
+    """Do works in threads of their own, while XLA compiles the `compiled` that is called inside.
+
+    On GPUs they wait until that is traced, or has come to an end without: JAX traces in Python,
+    which does one thing at a time, and the longer program would begin to compile later. On two CPU
+    cores it would compile more slowly beside them, so there they begin at once.
+    """
+    begun: list[Future[object]] = []
+    with ThreadPoolExecutor(max(1, len(works))) as pool:
+
+        def begin() -> None:
+            if not begun:
+                begun.extend(map(pool.submit, works))
+
+        before = _waiting.set(begin)
+        try:
+            if not on_gpu():
+                begin()
+            yield
+        finally:
+            _waiting.reset(before)
+        begin()
+        for work in begun:
+            work.result()
+
+
+_waiting: ContextVar[Callable[[], None] | None] = ContextVar("waiting", default=None)
+"""Begins what waits until a program is traced. Threads have none."""
+
+
 class compiled:
     """`jax.jit` with options for the compiler, for functions that no other jitted one calls.
 
@@ -191,7 +225,7 @@ class compiled:
         """What the function returns."""
         plain = _config.jax_disable_jit or _config.jax_debug_nans or _config.jax_debug_infs
         if self._key is None or kept.folder() is None or plain:
-            return self.traced(*arguments, **named)
+            return self._by_jax(*arguments, **named)
         if not self._mark._cache_size():  # so jax.clear_caches() has forgotten all programs
             self._programs.clear()
             self._last.clear()
@@ -205,9 +239,17 @@ class compiled:
                 return usual(**every)
         program = self._program(every, static, now)
         if program is None:
-            return self.traced(*arguments, **named)
+            return self._by_jax(*arguments, **named)
         self._last[now] = program
         return program(**every)
+
+    def _by_jax(self, *arguments: Any, **named: Any) -> Any:
+        """What the function returns, compiled and remembered by JAX."""
+        begin = _waiting.get()
+        if begin is not None:
+            self.traced.trace(*arguments, **named)  # which JAX remembers
+            begin()
+        return self.traced(*arguments, **named)
 
     def _program(self, every: dict[str, Any], static: dict[str, Any], now: Any) -> Any | None:
         """The program for these arguments in this context; None if JAX is to trace the function."""
@@ -236,6 +278,8 @@ class compiled:
             return None
         if program is None:
             lowered = self.traced.lower(**every, **static)
+            if (begin := _waiting.get()) is not None:
+                begin()
             with kept.unknown_to_jax():
                 program = lowered.compile()
             kept.keep(key, program)

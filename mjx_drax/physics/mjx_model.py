@@ -9,7 +9,6 @@ knows those that a model has, and `checks` measures whether they matter.
 from __future__ import annotations
 
 import copy
-import warnings
 
 import jax
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from mjx_drax.base.errors import DraxError
 from mjx_drax.physics._mjx import COLLISIONS, geom_pairs, internal, mjx
 from mjx_drax.physics.actuators import disabled, driven
-from mjx_drax.physics.contacts.collision import extended, hulls, make_data, signature
+from mjx_drax.physics.contacts.collision import extended, make_data, signature
 from mjx_drax.physics.contacts.pairs import Contacts, Pair, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
@@ -73,14 +72,8 @@ def put_model(
         without = set()
     _make_supported(supported, without)
     try:
-        with extended(without), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large faces of hulls, which are replaced
+        with extended(without):
             on_device = mjx.put_model(supported, device=jax.local_devices()[0], impl="jax")
-        own = internal(on_device).mesh_convex
-        found = hulls(model, [i for i, hull in enumerate(own) if hull is not None])
-        on_device = on_device.tree_replace(
-            {"_impl.mesh_convex": tuple(found.get(i, hull) for i, hull in enumerate(own))}
-        )
         on_device = on_device.replace(geom_margin=model.geom_margin, pair_margin=model.pair_margin)
         if without:
             signatures = sorted(signature(*pair) for pair in without)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -26,7 +25,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from mjx_drax.base.digests import digest
-from mjx_drax.kernels.compilation import rarely_collected
+from mjx_drax.kernels.compilation import rarely_collected, while_compiling
 from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
@@ -281,11 +280,8 @@ class Search:
             more.append(self._sizes)
         if self.few:
             more.append(self._compile_second)
-        with ThreadPoolExecutor(2) as pool:
-            others = [pool.submit(here, work) for work in more]
+        with while_compiling(*(partial(here, work) for work in more)):
             _, info = self._iterated(state, 0, 0)
-            for other in others:
-                other.result()
         return info
 
     def _compile_second(self, state: State) -> None:

@@ -4,12 +4,13 @@ import gc
 import os
 import subprocess
 import sys
+import time
 
 import jax
 import pytest
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.kernels import compilation
+from mjx_drax.kernels import compilation, kept
 from mjx_drax.kernels.compilation import compiled
 
 
@@ -123,6 +124,39 @@ def files_kept(tmp_path, **settings):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("key", [None, "one"])
+def test_what_compiles_beside_a_gpus_program_waits_until_it_is_traced(tmp_path, monkeypatch, key):
+    order = []
+
+    def traced_slowly(x):
+        time.sleep(0.2)
+        order.append("traced")
+        return x + 1
+
+    monkeypatch.setattr(kept, "folder", lambda: tmp_path)
+    monkeypatch.setattr(compilation, "on_gpu", lambda: True)
+    program = compiled(traced_slowly, key=lambda **arguments: key)
+    with compilation.while_compiling(lambda: order.append("beside"), lambda: order.append("too")):
+        assert program(x=1.0) == 2.0
+        assert order[0] == "traced"
+    assert sorted(order) == ["beside", "too", "traced"]
+
+
+def test_what_waits_for_a_program_comes_after_it_where_none_is_compiled_and_fails_as_it_would(
+    monkeypatch,
+):
+    order = []
+    monkeypatch.setattr(compilation, "on_gpu", lambda: True)
+    with compilation.while_compiling(lambda: order.append("beside")):
+        order.append("inside")
+    assert order == ["inside", "beside"]
+    with pytest.raises(ZeroDivisionError), compilation.while_compiling(lambda: 1 / 0):
+        pass
+    with pytest.raises(KeyError), compilation.while_compiling(lambda: order.append("never")):
+        raise KeyError
+    assert "never" not in order
+
+
 def test_programs_are_kept_on_disk_although_some_were_compiled_before(tmp_path):
     assert files_kept(tmp_path) > 0
 

@@ -30,6 +30,7 @@ from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.actuators import control_ranges, disabled
 from mjx_drax.physics.agreement.differences import PARTS, Change, differences, disabling, set_aside
 from mjx_drax.physics.c_engine.states import Engine, integrate, quiet, set_state, stopped_at_once
+from mjx_drax.physics.contacts.collision import hulls_of_one_size
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
@@ -309,7 +310,7 @@ def compare(
     """
     engine, joints, nv = Engine(model, contacts), Joints.of(model), model.nv
     ndx = 2 * nv + model.na
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), hulls_of_one_size():  # a few states, once
         on_device = put_model(model, contacts, bounded)
 
         def reached(model: mjx.Model, x: Array, u: Array) -> Array:

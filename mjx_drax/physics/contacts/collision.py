@@ -22,8 +22,9 @@ import contextlib
 import dataclasses
 import itertools
 import threading
-from collections.abc import Collection, Iterable, Iterator
-from functools import cache, partial
+from collections.abc import Collection, Iterator
+from contextvars import ContextVar
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import jax
@@ -38,6 +39,7 @@ from mjx_drax.physics._mjx import (
     collision_driver,
     internal,
     make_frame,
+    meshes,
     mjx,
     with_internal,
 )
@@ -67,7 +69,7 @@ SAME = 1e-6
 TURNS = 4
 """How often three corners of a face move on in turn; with sixteen corners they stop after three."""
 
-GROWTH = 4
+_GROWTH = ContextVar("growth", default=4.0)
 """Hulls whose numbers of corners are between the same powers of this are padded to one size."""
 
 POINTS = 66
@@ -88,6 +90,19 @@ Contacts = tuple[Array, Array, Array]
 
 
 @contextlib.contextmanager
+def hulls_of_one_size() -> Iterator[None]:
+    """Inside of this, all hulls are padded to the size of the largest.
+
+    One program serves all pairs of them then: it compiles in less time, and takes longer to run.
+    """
+    before = _GROWTH.set(np.inf)
+    try:
+        yield
+    finally:
+        _GROWTH.reset(before)
+
+
+@contextlib.contextmanager
 def extended(left_out: Pairs = ()) -> Iterator[None]:
     """Inside of this, MJX collides what is listed above.
 
@@ -99,16 +114,21 @@ def extended(left_out: Pairs = ()) -> Iterator[None]:
     """
     with _ONE_AT_A_TIME:
         table, pairs = dict(COLLISIONS), collision_driver.geom_pairs
-        groups = collision_driver._geom_groups
+        groups, convex = collision_driver._geom_groups, meshes.convex
 
         def kept(model: Any) -> Iterator[tuple[int, int, int]]:
             out = {signature(*pair) for pair in left_out}
             out |= {int(s) for s in model.exclude_signature if s < 0}
             yield from (pair for pair in pairs(model) if signature(*pair[:2]) not in out)
 
+        def hull(model: Any, which: int) -> ConvexMesh:
+            found = hull_of(model, which)
+            return convex(model, which) if found is None else found
+
         COLLISIONS.update(_OWN)
         collision_driver.geom_pairs = kept
         collision_driver._geom_groups = lambda model: _merged(model, groups(model))
+        meshes.convex = hull
         try:
             yield
         finally:
@@ -116,6 +136,7 @@ def extended(left_out: Pairs = ()) -> Iterator[None]:
             COLLISIONS.update(table)
             collision_driver.geom_pairs = pairs
             collision_driver._geom_groups = groups
+            meshes.convex = convex
 
 
 def _merged(model: Any, groups: dict[Any, list[Any]]) -> dict[Any, list[Any]]:
@@ -136,8 +157,8 @@ def _merged(model: Any, groups: dict[Any, list[Any]]) -> dict[Any, list[Any]]:
 
 
 def _size(hull: ConvexMesh) -> int:
-    """The power of `GROWTH` that a hull's number of corners is below."""
-    return int(np.ceil(np.log(len(hull.vert)) / np.log(GROWTH)))
+    """The power of `_GROWTH` that a hull's number of corners is below."""
+    return int(np.ceil(np.log(len(hull.vert)) / np.log(_GROWTH.get())))
 
 
 def _alike(model: mjx.Model, size: int) -> tuple[ConvexMesh, np.ndarray]:
@@ -342,16 +363,21 @@ def _around(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.n
     return corners[np.argsort(angle)]
 
 
-def hulls(model: mujoco.MjModel, which: Iterable[int]) -> dict[int, ConvexMesh]:
-    """The hulls of meshes, on the corners that the C engine has; without those that are flat."""
-    found = {}
-    for mesh in which:
-        graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
-        corners = graph[2 + graph[0] : 2 + 2 * graph[0]]
-        vertices = model.mesh_vert[model.mesh_vertadr[mesh] + corners]
-        with contextlib.suppress(QhullError):
-            found[mesh] = polytope(np.asarray(vertices, float))
-    return found
+def hull_of(model: mujoco.MjModel, which: int) -> ConvexMesh | None:
+    """The hull of a mesh, on the corners that the C engine has; None if it is flat."""
+    graph = model.mesh_graph[model.mesh_graphadr[which] :]
+    corners = graph[2 + graph[0] : 2 + 2 * graph[0]]
+    vertices = model.mesh_vert[model.mesh_vertadr[which] + corners]
+    try:
+        return _polytope_of(np.asarray(vertices, float).tobytes())
+    except QhullError:
+        return None
+
+
+@lru_cache(1000)
+def _polytope_of(points: bytes) -> ConvexMesh:
+    """`polytope`, which takes a tenth of a second for a mesh of 500 corners."""
+    return polytope(np.frombuffer(points).reshape(-1, 3))
 
 
 @cache

@@ -12,7 +12,7 @@ from mjx_drax.physics.contacts.collision import (
     CORNERS,
     collision,
     extended,
-    hulls,
+    hull_of,
     make_data,
     plane_box,
 )
@@ -230,7 +230,7 @@ def test_hulls_of_meshes_have_no_corner_outside_of_a_face():
         model = mujoco.MjModel.from_xml_string(
             MEETING.replace("{mesh}", vertex).format(kind="sphere", other=MESHES, margin=0.0)
         )
-        hull = hulls(model, [0])[0]
+        hull = hull_of(model, 0)
         inside = (hull.face_normal * hull.face[:, 0]).sum(axis=1)
         assert (hull.vert @ hull.face_normal.T - inside).max() < 1e-6
         corners, edges = len(hull.vert), len(hull.edge)
@@ -290,7 +290,7 @@ def test_hulls_of_other_sizes_are_one_computation_and_touch_as_each_alone():
         data = mjx.kinematics(on_device, make_data(on_device))
         contact = collision(on_device, data)._impl.contact
         assert [len(pairs) for pairs in groups.values()] == [3]
-        meshes, active = hulls(model, range(3)), 0
+        meshes, active = [hull_of(model, mesh) for mesh in range(3)], 0
         for i, (a, b) in enumerate(np.asarray(contact.geom[::4])):
             one, other = (
                 polytopes.moved(
