@@ -30,7 +30,9 @@ from mjx_drax.modelling.hulls import HULL_DISTANCES, HULLS, MESH, hulls_of
 from mjx_drax.physics import quaternion
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
+from mjx_drax.physics.mjx_model import unknown_sensors
 from mjx_drax.physics.motors import Actuators
+from mjx_drax.physics.observed import not_computed
 from mjx_drax.physics.source import index, load
 from mjx_drax.problem.cost import as_partial, at_knot, depends_on_knot
 from mjx_drax.problem.tracing import plain
@@ -197,8 +199,14 @@ class Terms:
         return self._term(_control, tuple(at), (wanted,), "control", len(at), weight)
 
     def sensor(self, name: str, *, target: ArrayLike = 0.0, weight: ArrayLike = 1.0) -> Term:
-        """What a sensor reads, in its units, against a target of its size."""
+        """What a sensor reads, in its units, against a target of its size.
+
+        Raises:
+            DraxError: MJX does not compute the sensor.
+        """
         sensor = index(self.model, "sensor", name)
+        if unknown_sensors(self.model)[sensor]:
+            raise not_computed(name)
         start, size = int(self.model.sensor_adr[sensor]), int(self.model.sensor_dim[sensor])
         wanted = _target(f"target of sensor {name!r}", target, size, alike=True)
         where = ("sensordata", tuple(range(start, start + size)))

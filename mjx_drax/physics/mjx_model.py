@@ -27,15 +27,15 @@ _TOUCHED = (mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_CONTACT)
 NOT_COMPUTED = -1
 """First integer parameter of a sensor that MJX does not compute, so that no cost reads it."""
 
-_NET_FORCE = 3
+_ALL, _NET_FORCE = 0, 3
 """How contact sensors say reduce="netforce"."""
 
 MOST_CONTACTS = 32
 """Contact points of each friction dimension (condim) that a plan keeps by default: as many as eight
 boxes on the floor have. A step with half as many takes as long."""
 
-SLIPPERY = 1e-7
-"""Friction of contacts that have none; with MuJoCo's least, 1e-5, a velocity was off by 7e-4."""
+IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_DISCRETE)
+"""Integrators that are planned with as "implicitfast"."""
 
 HELD = 1e5
 """Damping, in M / timestep, above which a joint stays where it is, as a base does that a file holds
@@ -74,7 +74,8 @@ def put_model(
     try:
         with extended(without):
             on_device = mjx.put_model(supported, device=jax.local_devices()[0], impl="jax")
-        on_device = on_device.replace(geom_margin=model.geom_margin, pair_margin=model.pair_margin)
+        put_back = ("geom_margin", "pair_margin", "geom_condim", "pair_dim")
+        on_device = on_device.replace(**{name: getattr(model, name) for name in put_back})
         if without:
             signatures = sorted(signature(*pair) for pair in without)
             excluded = np.append(on_device.exclude_signature, signatures)
@@ -138,7 +139,7 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
     opt = model.opt
     opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)  # the inertia as `tree` computes it
     opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all solvers find the same minimum
-    if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+    if opt.integrator in IMPLICIT:
         opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
     springs, dampers = int(_DISABLE.mjDSBL_SPRING), int(_DISABLE.mjDSBL_DAMPER)
@@ -162,10 +163,12 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
     if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
         # No contact has friction, and MJX fails if elliptic cones are asked for and there are none
         opt.cone = int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
-    if opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-        _give_cones(model, touching)
-    # MJX refuses margins of meshes and height fields; `put_model` and `collision` care for them
+    # `put_model` and `collision` care for what MJX refuses: margins of meshes and height fields,
+    # and among elliptic cones contacts without friction
     model.geom_margin[:], model.pair_margin[:] = 0.0, 0.0
+    if opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        model.geom_condim[model.geom_condim == 1] = 3
+        model.pair_dim[model.pair_dim == 1] = 3
     if not touching:  # MJX fails in these sensors, because there is no array of contacts
         touch = np.isin(model.sensor_type, [int(kind) for kind in _TOUCHED])
         model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
@@ -181,38 +184,17 @@ def _pairs(model: mujoco.MjModel, without: set[Pair]) -> list[tuple[int, int, in
     return [(int(a), int(b), int(i)) for a, b, i in geom_pairs(model) if (a, b) not in without]
 
 
-def _condim(model: mujoco.MjModel, a: int, b: int, pair: int) -> int:
-    """The friction dimension of the contacts of two geoms."""
-    if pair >= 0:
-        return int(model.pair_dim[pair])
-    priority, own = model.geom_priority[[a, b]], model.geom_condim[[a, b]]
-    return int(own.max() if priority[0] == priority[1] else own[priority.argmax()])
-
-
-def _give_cones(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
-    """Give contacts without friction (condim 1) a cone, of almost no friction.
-
-    MJX lacks them among elliptic cones. The friction of a contact is the larger one of its two
-    geoms, so that friction is lost where such a geom has more of it than another one that it meets
-    with friction; a step then differs.
-    """
-    for a, b, pair in pairs:
-        if _condim(model, a, b, pair) == 1:
-            if pair >= 0:
-                model.pair_friction[pair] = SLIPPERY
-            else:
-                model.geom_friction[[a, b]] = SLIPPERY
-    model.geom_condim[model.geom_condim == 1] = 3
-    model.pair_dim[model.pair_dim == 1] = 3
-
-
 def unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
-    """Sensors that MJX does not compute, (nsensor,)."""
+    """Sensors that MJX does not compute, or not as the C engine does, (nsensor,).
+
+    Those that read late are among them, and lists of contacts (reduce="none"), whose order differs.
+    """
     unknown = np.array([int(kind) not in _SENSORS for kind in model.sensor_type], bool)
+    unknown |= (model.sensor_delay > 0) | (model.sensor_interval[:, 0] > 0)
     between = np.stack([model.sensor_objtype, model.sensor_reftype], axis=1)
     body = (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
     refused = np.isin(between, [int(kind) for kind in body]).any(axis=1)
-    refused |= model.sensor_intprm[:, 1] == _NET_FORCE
+    refused |= np.isin(model.sensor_intprm[:, 1], (_ALL, _NET_FORCE))
     unknown |= refused & (model.sensor_type == int(mujoco.mjtSensor.mjSENS_CONTACT))
     touch = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_TOUCH))
     cylinders = model.site_type[model.sensor_objid[touch]] == int(mujoco.mjtGeom.mjGEOM_CYLINDER)
@@ -315,4 +297,9 @@ def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
     single = np.isin(model.jnt_type, (SLIDE, HINGE)) & (model.jnt_limited != 0)
     start = x_init[model.jnt_qposadr]
     lower, upper = free_ranges(model)
-    return single & driven(model) & (start > lower) & (start < upper)
+    return has_limits(model) & single & driven(model) & (start > lower) & (start < upper)
+
+
+def has_limits(model: mujoco.MjModel) -> bool:
+    """Whether no flag of the model disables the limits of its joints."""
+    return not model.opt.disableflags & (_DISABLE.mjDSBL_LIMIT | _DISABLE.mjDSBL_CONSTRAINT)

@@ -21,6 +21,10 @@ _FORMS = (
 )
 
 
+_SETTINGS = ("gear", "group", "armature", "damping", "delay", "nsample")
+"""What an actuator has of the file's defaults after it is set to a motor or a servo."""
+
+
 def add_motors(spec: mujoco.MjSpec, actuators: Actuators, name: str) -> None:
     """Give each hinge and slide an actuator of its own name.
 
@@ -32,6 +36,7 @@ def add_motors(spec: mujoco.MjSpec, actuators: Actuators, name: str) -> None:
     A motor's limit is the range that the joint gives by `actuatorfrcrange` (a URDF's effort), else
     the number given, else there is none. A servo's control has the range of the joint. With
     {pattern: number} only joints whose names fit a pattern get one; the first that fits counts.
+    A joint that an equality makes follow another (a URDF's mimic) gets one by its whole name only.
 
     Args:
         spec: of a model, which is changed.
@@ -47,13 +52,18 @@ def add_motors(spec: mujoco.MjSpec, actuators: Actuators, name: str) -> None:
         raise DraxError(
             f"actuators is {shown(actuators)}, and {name} has {model.nu} of its own: leave it out."
         )
-    fitted = set()
+    fitted, plain = set(), mujoco.MjSpec().add_actuator()
+    followers = {
+        equality.name1
+        for equality in spec.equalities
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active
+    }
     for joint in spec.joints:
         j = joint.id
         if model.jnt_type[j] not in (HINGE, SLIDE):
             continue
         pattern = next((p for p in numbers if fnmatch.fnmatchcase(joint.name, p)), None)
-        if pattern is None:
+        if pattern is None or (joint.name in followers and pattern != joint.name):
             continue
         fitted.add(pattern)
         joint.name = joint.name or f"joint_{j}"
@@ -70,8 +80,8 @@ def add_motors(spec: mujoco.MjSpec, actuators: Actuators, name: str) -> None:
                 limit = model.jnt_actfrcrange[j]
             elif number is not None:
                 limit = np.array([-number, number])
-        # Defaults of the file are for other actuators
-        actuator.gear[:] = [1, 0, 0, 0, 0, 0]
+        for setting in _SETTINGS:  # defaults of the file are for other actuators
+            setattr(actuator, setting, getattr(plain, setting))
         actuator.forcelimited, actuator.ctrllimited = 0, int(limit is not None)
         if limit is not None:
             actuator.ctrlrange = limit

@@ -4,7 +4,8 @@
 
 A function of these works in a cost and in a goal alike, because names and shapes are MuJoCo's: a
 matrix is (9,), and what a joint, a sensor or an actuator has is a vector, also where it is one
-number. An element may also be given by its number.
+number. An element may also be given by its number. In `data.sensordata` what MJX does not compute
+is NaN.
 """
 
 from __future__ import annotations
@@ -128,10 +129,7 @@ class Element:
             return values[..., slice(*names.positions[i])]
         if name == "sensordata":
             if i in names.unknown:
-                raise DraxError(
-                    f"sensor {self.name!r} is of a kind that MJX does not compute: use positions, "
-                    "velocities and forces of bodies, sites and joints instead."
-                )
+                raise not_computed(self.name)
             return values[..., slice(*names.sensors[i])]
         if name.startswith("q"):
             return values[..., slice(*names.velocities[i])]
@@ -141,6 +139,14 @@ class Element:
             own = values[..., i, :, :]
             return jnp.reshape(own, (*own.shape[:-2], 9))
         return values[..., i, :]
+
+
+def not_computed(sensor: str) -> DraxError:
+    """The error of a cost that reads such a sensor."""
+    return DraxError(
+        f"sensor {sensor!r} is of a kind that MJX does not compute: use positions, velocities and "
+        "forces of bodies, sites and joints instead."
+    )
 
 
 def _attribute(array: str) -> str:
@@ -159,7 +165,11 @@ class Observed(mjx.Data):
     def of(cls, model: mjx.Model, data: mjx.Data) -> Observed:
         """The data with the names of its model."""
         arrays = {field.name: getattr(data, field.name) for field in fields(data)}
-        return cls(**arrays, names=Names.in_model(model))
+        names = Names.in_model(model)
+        for i in names.unknown:  # to MJX they are 0
+            entries = slice(*names.sensors[i])
+            arrays["sensordata"] = arrays["sensordata"].at[entries].set(jnp.nan)
+        return cls(**arrays, names=names)
 
     def body(self, name: str | int) -> Element:
         """A body: xpos (3,), xquat (4,), xmat (9,), xipos, ximat, cvel (6,), subtree_com (3,)."""

@@ -19,6 +19,7 @@ from mjx_drax.physics.mjcf import steps_between_knots
 from mjx_drax.physics.mjx_model import (
     constraint_rows,
     contact_points,
+    has_limits,
     kept_contacts,
     put_model,
 )
@@ -116,7 +117,7 @@ def _joints(model: mujoco.MjModel, bounded: np.ndarray) -> list[Report]:
     """Every joint: what drives it, and whether its range is a bound or a limit in the dynamics."""
     pulls, found = largest_moment_arms(model) > 0, []
     for j in range(model.njnt):
-        limited = bool(model.jnt_limited[j])
+        limited = bool(model.jnt_limited[j]) and has_limits(model)
         actuators = np.flatnonzero(pulls[:, model.dof_jntid == j].any(axis=1))
         range_ = model.jnt_range[j].tolist() if limited else None
         found.append(
@@ -163,6 +164,8 @@ def text(report: Report) -> str:
     rows, points = sizes["constraint_rows"], report["contact_points"]
     if points["kept"] == points["all"]:
         kept = "all of them in a plan"
+    elif points["nearest"] is None:  # those of other pairs are left out
+        kept = f"a plan keeps {points['kept']}"
     else:
         kept = f"a plan keeps {points['kept']}, the nearest {points['nearest']} of each condim"
     lines = [
@@ -170,7 +173,7 @@ def text(report: Report) -> str:
         "sizes        " + ", ".join(f"{k} {sizes[k]}" for k in ("nq", "nv", "nu", "na", "ndx")),
         f"constraints  {'unknown' if rows is None else rows} rows, "
         f"{report['contact_pairs']} pairs of geoms that may touch",
-        f"contacts     {'unknown' if rows is None else points['all']} points, {kept}",
+        "contacts     " + ("unknown" if rows is None else f"{points['all']} points, {kept}"),
         f"time         timestep {timing['timestep']:g} s, dt {timing['dt']:g} s, "
         f"integrator {timing['integrator']}",
     ]

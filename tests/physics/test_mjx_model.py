@@ -10,6 +10,7 @@ import pytest
 
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
+from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.actuators import driven
 from mjx_drax.physics.agreement.checks import Samples, compare, examine
 from mjx_drax.physics.agreement.differences import differences, set_aside
@@ -18,6 +19,7 @@ from mjx_drax.physics.c_engine.stepper import Stepper
 from mjx_drax.physics.contacts.pairs import contact_pairs
 from mjx_drax.physics.mjx_model import (
     MOST_CONTACTS,
+    bounded_joints,
     constraint_rows,
     contact_points,
     has_constraints,
@@ -25,6 +27,7 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.observed import Observed
+from mjx_drax.physics.report import check
 from mjx_drax.physics.step import data_at, forward, step
 
 CHAIN = """
@@ -87,10 +90,11 @@ def test_what_is_made_supported_steps_like_the_c_engine(parts):
     np.testing.assert_allclose(compare(model, STATES).velocity, 0, atol=1e-10)
 
 
-def test_implicit_becomes_implicitfast_and_is_named():
-    model = rigid(option='integrator="implicit"')
+@pytest.mark.parametrize("integrator", ["implicit", "discrete"])
+def test_implicit_becomes_implicitfast_and_is_named(integrator):
+    model = rigid(option=f'integrator="{integrator}"')
     assert put_model(model).opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert any('"implicit" is planned' in each.sentence for each in differences(model))
+    assert any(f'"{integrator}" is planned' in each.sentence for each in differences(model))
 
 
 def test_the_model_is_left_as_it_was():
@@ -99,6 +103,17 @@ def test_the_model_is_left_as_it_was():
     put_model(model, contacts=False, bounded=np.ones(2, bool))
     assert (model.opt.solver, model.opt.disableflags, model.jnt_stiffness[0]) == before
     assert np.all(model.actuator_gainprm[:, 0] == 1)
+
+
+def test_limits_that_a_flag_disables_are_no_bounds():
+    joint = 'range="-1 1" limited="true"'
+    bounded = [
+        bounded_joints(rigid(joint=joint, flag=flag), np.zeros(4)).tolist()
+        for flag in ('contact="enable"', 'limit="disable"', 'constraint="disable"')
+    ]
+    assert bounded == [[True, False], [False, False], [False, False]]
+    report = check(rigid(joint=joint, flag='limit="disable"'))
+    assert [each["range_is"] for each in report["joints"]] == ["none", "none"]
 
 
 def test_limits_that_are_bounds_leave_the_dynamics():
@@ -183,6 +198,27 @@ def test_frictionless_contacts_have_elliptic_cones_too():
     assert compare(model, at).velocity[0] < 1e-5
 
 
+SLICK = """
+<mujoco><option timestep="0.005" cone="elliptic"/><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1" friction=".2 .005 .0001"/>
+  <body pos="0 0 .0995">
+    <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+    <geom name="block" type="box" size=".1 .1 .1" mass="1" condim="1" friction="1.5 .005 .0001"/>
+  </body>
+  <body pos="1 0 .1"><joint name="push" type="slide" axis="1 0 0" damping=".5"/>
+    <geom type="sphere" size=".05" mass="1" condim="1"/></body>
+</worldbody><actuator><motor joint="push"/></actuator><contact>{pair}</contact></mujoco>"""
+
+
+@pytest.mark.parametrize("pair", ["", '<pair geom1="floor" geom2="block" condim="1"/>'])
+def test_geoms_that_slip_on_one_another_keep_their_friction_with_others(pair):
+    model = mujoco.MjModel.from_xml_string(SLICK.format(pair=pair))
+    at = Samples(np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]]), np.zeros((1, 1)))
+    slower = at.x[0, 3] - Engine(model).step(at.x[0], at.u[0])[3]
+    assert slower < 1e-6 if pair else slower > 0.3
+    assert compare(model, at).velocity[0] < 1e-6
+
+
 def test_meshes_on_planes_have_margins():
     cube = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
     model = mujoco.MjModel.from_xml_string(
@@ -251,7 +287,13 @@ def test_what_mjx_fails_in_without_contacts_or_materials_is_stepped(parts):
 
 
 @pytest.mark.parametrize(
-    "contact", ['body1="upper"', 'site="tip"', 'geom1="link" reduce="netforce" data="force"']
+    "contact",
+    [
+        'body1="upper"',
+        'site="tip"',
+        'geom1="link" reduce="netforce" data="force"',
+        'geom1="link" reduce="none"',
+    ],
 )
 def test_contact_sensors_that_mjx_refuses_are_left_out(contact):
     model = chain(more=TOUCH.format(f'contact name="odd" {contact}'))
@@ -270,6 +312,20 @@ def test_a_touch_sensor_in_a_cylinder_is_left_out():
     assert jax.eval_shape(partial(forward, on_device), jnp.zeros(13), jnp.zeros(0)) is not None
 
 
+@pytest.mark.parametrize("late", ['delay="0.05" nsample="8"', 'interval="0.05"'])
+def test_a_sensor_that_reads_late_is_left_out(late):
+    model = rigid(more=f'<sensor><jointpos name="odd" joint="one" {late}/></sensor>')
+    assert set_aside(model) == ["sensor 'odd' is unknown to MJX: a cost cannot read it"]
+
+
+def test_a_mocap_body_that_a_keyframe_moves_is_told():
+    more = '<worldbody><body name="hand" mocap="true"{}/></worldbody>'
+    more += '<keyframe><key qpos="0 0" mpos="1 0 0"/></keyframe>'
+    (sentence,) = set_aside(rigid(more=more.format("")))
+    assert "'hand' stays where the file has it, and not where the first keyframe" in sentence
+    assert set_aside(rigid(more=more.format(' pos="1 0 0"'))) == []
+
+
 def test_a_cost_that_reads_an_unknown_sensor_is_refused():
     model = rigid(
         more='<sensor><user name="odd" dim="1"/><jointpos name="fine" joint="one"/></sensor>'
@@ -279,6 +335,9 @@ def test_a_cost_that_reads_an_unknown_sensor_is_refused():
     assert at.sensor("fine").data.shape == (1,)
     with pytest.raises(DraxError, match="'odd' is of a kind that MJX does not compute"):
         _ = at.sensor("odd").data
+    with pytest.raises(DraxError, match="'odd' is of a kind that MJX does not compute"):
+        Terms(model).sensor("odd")
+    assert np.isnan(at.sensordata).tolist() == [True, False]
 
 
 CONNECT = '<equality><connect body1="lower" body2="world" anchor="0 0 0"/></equality>'

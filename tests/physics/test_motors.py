@@ -85,6 +85,24 @@ def test_a_model_is_written_with_its_motors(tmp_path):
     np.testing.assert_array_equal(again.actuator_ctrlrange, model.actuator_ctrlrange)
 
 
+def test_defaults_of_the_file_are_for_other_actuators():
+    given = 'gear="50" group="3" armature="4" damping="3" delay=".01" nsample="2"'
+    defaults = f"<default><motor {given}/></default>"
+    model = load(LEG.replace("<worldbody>", f"{defaults}<worldbody>", 1), "torque")
+    for name in ("group", "armature", "damping", "delay"):
+        assert not np.any(getattr(model, f"actuator_{name}")), name
+    assert np.all(model.actuator_gear[:, 0] == 1)
+
+
+def test_a_joint_that_follows_another_gets_a_motor_only_by_its_name():
+    follows = '<equality><joint joint1="knee" joint2="hip"/></equality></mujoco>'
+    leg = LEG.replace("</mujoco>", follows)
+    every = [load(LEG, "torque").actuator(i).name for i in range(3)]
+    some = load(leg, "torque")
+    assert [some.actuator(i).name for i in range(some.nu)] == [n for n in every if n != "knee"]
+    assert load(leg, {"torque": {"knee": 1.0}}).nu == 1
+
+
 def test_a_urdf_gives_its_efforts():
     link = '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" '
     link += 'ixy="0" ixz="0" iyz="0"/></inertial></link>'

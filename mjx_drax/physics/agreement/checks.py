@@ -34,7 +34,7 @@ from mjx_drax.physics.contacts.collision import hulls_of_one_size
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
-from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, put_model
+from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, has_limits, put_model
 from mjx_drax.physics.source import binary
 
 SINGULAR = 1e-10
@@ -173,7 +173,7 @@ def _beyond_limits(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> str 
 
     It can be planned from, since the limit's force pushes back, but is hardly ever what is meant.
     """
-    single = np.isin(model.jnt_type, (SLIDE, HINGE)) & (model.jnt_limited != 0)
+    single = np.isin(model.jnt_type, (SLIDE, HINGE)) & (model.jnt_limited != 0) & has_limits(model)
     position, (low, high) = x_init[model.jnt_qposadr], model.jnt_range.T
     beyond = np.maximum(low - position, position - high)
     found = [

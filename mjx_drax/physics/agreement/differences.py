@@ -15,6 +15,7 @@ import numpy as np
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjx_model import (
+    IMPLICIT,
     LIMIT,
     OTHER_CONTACTS,
     PAIRS,
@@ -70,12 +71,12 @@ def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[Differ
     Found by comparing one step of both engines in many models: each changed velocities by 2e-5 to
     0.7.
     """
-    implicit = int(mujoco.mjtIntegrator.mjINT_IMPLICIT)
+    integrator = mujoco.mjtIntegrator(model.opt.integrator).name[len("mjINT_") :].lower()
     pulling = np.isin(model.eq_type, _PULLING)
     cases: list[tuple[Any, str, Change]] = [
         (
-            model.opt.integrator == implicit,
-            'integrator "implicit" is planned with as "implicitfast": choose that, or "Euler"',
+            model.opt.integrator in IMPLICIT,
+            f'integrator "{integrator}" is planned with as "implicitfast": choose that, or "Euler"',
             option("integrator", int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)),
         ),
         (
@@ -161,4 +162,15 @@ def set_aside(model: mujoco.MjModel) -> list[str]:
         f"sensor {model.sensor(int(i)).name!r} is unknown to MJX: a cost cannot read it"
         for i in np.flatnonzero(unknown_sensors(model))
     ]
+    bodies = np.flatnonzero(model.body_mocapid >= 0)
+    if model.nkey and bodies.size:
+        which = model.body_mocapid[bodies]
+        there = model.key_mpos[0].reshape(-1, 3)[which], model.key_mquat[0].reshape(-1, 4)[which]
+        here = model.body_pos[bodies], model.body_quat[bodies]
+        moved = [np.abs(a - b).max(axis=1) > 1e-6 for a, b in zip(here, there, strict=True)]
+        found += [
+            f"mocap body {model.body(int(i)).name!r} stays where the file has it, and not where "
+            "the first keyframe does: give the body the keyframe's pos and quat"
+            for i in bodies[moved[0] | moved[1]]
+        ]
     return found
