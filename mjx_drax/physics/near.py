@@ -9,7 +9,7 @@ import numpy as np
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.agreement.checks import samples
 from mjx_drax.physics.c_engine.states import Engine, quiet, set_state
-from mjx_drax.physics.contacts.collision import BOX, MESH
+from mjx_drax.physics.contacts.collision import corners
 from mjx_drax.physics.contacts.pairs import Contacts, Pair, contact_pairs, geom_name
 from mjx_drax.physics.engine import mujoco
 
@@ -61,14 +61,7 @@ def affordable(
 
 def _work(model: mujoco.MjModel, a: int, b: int) -> int:
     """Pairs of corners of two geoms."""
-    return _corners(model, a) * _corners(model, b)
-
-
-def _corners(model: mujoco.MjModel, g: int) -> int:
-    kind, mesh = int(model.geom_type[g]), int(model.geom_dataid[g])
-    if kind != MESH:
-        return 8 if kind == BOX else 1
-    return int(model.mesh_graph[model.mesh_graphadr[mesh]])
+    return corners(model, a) * corners(model, b)
 
 
 def _least_distances(

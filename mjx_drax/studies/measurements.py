@@ -27,7 +27,6 @@ certified answer after so many seconds, and one near the best known, by the same
 
 from __future__ import annotations
 
-import os
 import platform
 import time
 from collections.abc import Sequence
@@ -43,6 +42,7 @@ from jax import Array
 from mjx_drax import __version__
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin
+from mjx_drax.physics.c_engine.stepper import cores
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
@@ -89,7 +89,7 @@ def machine() -> Row:
     device = jax.devices()[0]
     return {
         "device": device.device_kind,
-        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "cpus": cores(),
         "mjx_drax": __version__,
         "jax": jax.__version__,
         "python": platform.python_version(),

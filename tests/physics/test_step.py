@@ -17,7 +17,7 @@ from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.model import linearize
 from mjx_drax.physics.agreement.checks import Samples, compare
 from mjx_drax.physics.c_engine.states import Engine, difference, moved
-from mjx_drax.physics.c_engine.stepper import Spare, Stepper
+from mjx_drax.physics.c_engine.stepper import Spare, Stepper, cores
 from mjx_drax.problem.trajectory import Trajectory
 
 SWINGING = """
@@ -366,11 +366,19 @@ def test_what_actuators_remember_is_not_taken_from_a_replay_before():
 
 
 def test_threads_go_by_the_work_of_a_knot(monkeypatch):
-    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    monkeypatch.setattr("mjx_drax.physics.c_engine.stepper.cores", lambda: 16)
     unknown, light, heavy = (Spare(seconds=s) for s in (np.inf, 5e-5, 1.4e-3))
     assert [unknown.threads(n) for n in (1, 8, 9, 64, 999)] == [1, 1, 2, 8, 16]
     assert [light.threads(n) for n in (1, 8, 9, 64, 999)] == [1, 1, 2, 8, 16]
     assert [heavy.threads(n) for n in (1, 4, 64)] == [1, 4, 16]
+
+
+def test_cores_are_those_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: {3, 5, 8}, raising=False)
+    assert cores() == 3
+    monkeypatch.delattr("os.sched_getaffinity")
+    assert cores() == 64
 
 
 def test_a_stepper_learns_how_long_a_knot_takes():

@@ -44,7 +44,14 @@ class Spare:
         wanted = chains / CHAINS_PER_THREAD
         if math.isfinite(self.seconds):
             wanted = chains * self.seconds / WORTH_A_THREAD
-        return min(math.ceil(wanted), chains, os.cpu_count() or 1)
+        return min(math.ceil(wanted), chains, cores())
+
+
+def cores() -> int:
+    """How many CPU cores this process may use: a job's share of a cluster's node, for example."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1  # macOS, Windows
 
 
 class Stepper:

