@@ -73,7 +73,7 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
                 raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
             if is_binary(source):
                 return mujoco.MjModel.from_binary_path(str(source))
-            return mujoco.MjModel.from_xml_path(str(source))
+            return mujoco.MjModel.from_xml_path(str(Path(source).absolute()))
     except DraxError:
         raise
     except TypeError as error:
@@ -91,8 +91,10 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
 
 def _spec(source: str | Path, actuators: Actuators | None) -> mujoco.MjSpec:
     """What MuJoCo compiles, of a file or an XML string."""
-    xml = is_xml(source)
-    spec = mujoco.MjSpec.from_string(source) if xml else mujoco.MjSpec.from_file(str(source))
+    if is_xml(source):
+        spec = mujoco.MjSpec.from_string(source)
+    else:  # absolute, as in `_compiled`: a model holds paths of models that it attaches
+        spec = mujoco.MjSpec.from_file(str(Path(source).absolute()))
     if actuators is not None:
         add_motors(spec, actuators, spec.modelname)
     return spec
@@ -158,7 +160,7 @@ def origin_of(
         return None
     if actuators is not None:
         return Source.of(given, model, actuators)
-    return given if is_xml(given) else Path(given).resolve()
+    return given if is_xml(given) else Path(given).absolute()
 
 
 def binary(model: mujoco.MjModel) -> bytes:
@@ -198,16 +200,19 @@ class Source:
         """
         try:
             spec = _spec(given, actuators)
-            folder = Path() if is_xml(given) else Path(given).parent
+            folders = [Path()] if is_xml(given) else _folders(Path(given))
             if binary(spec.compile()) != binary(model):
                 raise DraxError("it has changed since the model was loaded.")
             root = ElementTree.fromstring(spec.to_xml())
             assets: dict[str, bytes] = {}
-            folders = {kind: folder / getattr(spec, where) for kind, where in _FOLDER_OF.items()}
+            kinds = {"mesh": spec.meshes, "texture": spec.textures}
+            own = {(tag, each.name): each.compiler for tag in kinds for each in kinds[tag]}
             for element in (e for e in root.iter() if e.tag in _FOLDER_OF):
+                compiler = own.get((element.tag, element.get("name", "")), spec)
+                inside = getattr(compiler, _FOLDER_OF[element.tag])
                 for attribute in [a for a in element.attrib if a.startswith("file")]:
                     path = element.attrib[attribute]
-                    content = (folders[element.tag] / path).read_bytes()
+                    content = _content([folder / inside / path for folder in folders])
                     name = _free_name(PurePosixPath(path).name, content, assets)
                     element.attrib[attribute], assets[name] = name, content
         except (ValueError, OSError) as error:
@@ -233,6 +238,32 @@ class Source:
             ValueError: MuJoCo cannot compile it.
         """
         return mujoco.MjModel.from_xml_string(self.xml, dict(self.assets))
+
+
+def _folders(path: Path) -> list[Path]:
+    """Where a file of MJCF lies, and models that it attaches, also by files that it includes."""
+    found = [path.parent]
+    try:
+        elements = list(ElementTree.parse(path).getroot().iter())
+    except ElementTree.ParseError:  # MuJoCo is less strict
+        return found
+    for element in elements:
+        other = path.parent / element.get("file", "")
+        if element.tag in ("model", "include") and other.is_file():
+            found += _folders(other)
+    return list(dict.fromkeys(found))
+
+
+def _content(places: list[Path]) -> bytes:
+    """What a file holds that lies in one of several places.
+
+    Raises:
+        OSError: there is none, or other files of that name have another content.
+    """
+    found = {place.read_bytes() for place in places if place.is_file()} or {places[0].read_bytes()}
+    if len(found) > 1:
+        raise OSError(f"files {places[0].name!r} of several of its models differ: rename one")
+    return found.pop()
 
 
 def _free_name(name: str, content: bytes, taken: dict[str, bytes]) -> str:

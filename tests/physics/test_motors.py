@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mjx_drax import DraxError
-from mjx_drax.physics.source import load, origin_of
+from mjx_drax.physics.source import Source, load, origin_of
 
 XML = """
 <mujoco model="leg">
@@ -83,6 +83,42 @@ def test_a_model_is_written_with_its_motors(tmp_path):
     again = origin_of(path, model, "torque").compiled()
     assert (model.nu, again.nu) == (3, 3)
     np.testing.assert_array_equal(again.actuator_ctrlrange, model.actuator_ctrlrange)
+
+
+PART = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="m" file="m.obj"/></asset>
+  <worldbody><body name="x"><joint axis="0 1 0"/><geom type="mesh" mesh="m"/></body></worldbody>
+</mujoco>"""
+ATTACHED = """<mujoco model="two"><asset><model name="part" file="part/part.xml"/>{more}</asset>
+  <worldbody><frame><attach model="part" body="x" prefix="p_"/></frame>
+  <body name="y"><joint axis="0 1 0"/><geom size=".1"/></body></worldbody></mujoco>"""
+CORNERS = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 {}\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def test_a_model_that_attaches_another_is_written_with_the_meshes_of_both(tmp_path, monkeypatch):
+    (tmp_path / "part" / "meshes").mkdir(parents=True)
+    (tmp_path / "part" / "part.xml").write_text(PART)
+    (tmp_path / "part" / "meshes" / "m.obj").write_text(CORNERS.format(0.1))
+    (tmp_path / "own.obj").write_text(CORNERS.format(0.2))
+    (tmp_path / "two.xml").write_text(ATTACHED.format(more='<mesh name="own" file="own.obj"/>'))
+    monkeypatch.chdir(tmp_path)
+    model = load("two.xml", "torque")
+    source = Source.of(tmp_path / "two.xml", model, "torque")  # by its absolute path
+    assert sorted(source.assets) == ["m.obj", "own.obj"]
+    again = source.compiled()
+    assert (model.nu, again.nu) == (2, 2)
+    np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
+
+
+def test_files_of_one_name_in_two_models_are_not_confused(tmp_path):
+    (tmp_path / "part" / "meshes").mkdir(parents=True)
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "part" / "part.xml").write_text(PART)
+    (tmp_path / "part" / "meshes" / "m.obj").write_text(CORNERS.format(0.1))
+    (tmp_path / "meshes" / "m.obj").write_text(CORNERS.format(0.2))
+    (tmp_path / "two.xml").write_text(ATTACHED.format(more=""))
+    model = load(tmp_path / "two.xml", "torque")
+    with pytest.raises(DraxError, match=r"files 'm\.obj' of several of its models differ"):
+        Source.of(tmp_path / "two.xml", model, "torque")
 
 
 def test_defaults_of_the_file_are_for_other_actuators():
