@@ -28,7 +28,7 @@ NOT_COMPUTED = -1
 """First integer parameter of a sensor that MJX does not compute, so that no cost reads it."""
 
 _ALL, _NET_FORCE = 0, 3
-"""How contact sensors say reduce="netforce"."""
+"""How contact sensors say reduce="none" and reduce="netforce"."""
 
 MOST_CONTACTS = 32
 """Contact points of each friction dimension (condim) that a plan keeps by default: as many as eight

@@ -83,7 +83,8 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
         ) from error
     except (ValueError, OSError, mujoco.FatalError) as error:
         words = " ".join(str(error).split())
-        fix = next((fix for part, fix in _FIXES.items() if part in words), "Correct the MJCF.")
+        usual = "Compile it again, with this MuJoCo." if is_binary(source) else "Correct the MJCF."
+        fix = next((fix for part, fix in _FIXES.items() if part in words), usual)
         raise DraxError(
             f"MuJoCo cannot compile {shown(str(source))}: {cut(words)} {fix}"
         ) from error

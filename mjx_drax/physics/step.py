@@ -1,6 +1,6 @@
 """One step of MJX, with derivatives that hold at rest and in contact.
 
-Six things differ from `mjx.step`. Only the last two change values:
+Seven things differ from `mjx.step`. Only the last three change values:
 
 - Constraint forces (contacts, limits, dry friction, equalities) minimize a convex function of the
   acceleration, 1/2 |a - a_smooth|^2_M + s(J a - a_ref), with the function s of MJX. Newton's method
@@ -15,6 +15,7 @@ Six things differ from `mjx.step`. Only the last two change values:
   inertia M is dense and factorized by `linalg`.
 - Boxes on planes have the contacts of the C engine; see `collision`.
 - The integrator implicitfast has the C engine's derivative of forces by velocities.
+- Connect and weld constraints have the C engine's references while bodies turn; see `equalities`.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from mjx_drax.kernels.pruning import pruned
 from mjx_drax.physics._mjx import internal, mjx, with_internal
 from mjx_drax.physics.contacts.collision import collision, make_data
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.equalities import with_turning
 from mjx_drax.physics.joints import BALL, FREE, Joints
 from mjx_drax.physics.mjx_model import has_constraints
 from mjx_drax.physics.tree import (
@@ -94,7 +96,7 @@ def _driven(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     turned = np.isin(model.jnt_type, (FREE, BALL))
     if turned.any():  # their springs have pulled
         model = model.replace(jnt_stiffness=jnp.where(turned, 0.0, model.jnt_stiffness))
-    data = mjx.fwd_actuation(model, _at_velocities(model, data))
+    data = mjx.fwd_actuation(model, with_turning(model, _at_velocities(model, data)))
     force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator + data.qfrc_applied
     qacc = solve_positive(internal(data).M, force)
     return data.replace(qfrc_smooth=force, qacc_smooth=qacc)

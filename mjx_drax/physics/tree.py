@@ -213,10 +213,15 @@ def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.replace(cvel=cvel, cdof_dot=_crossed(before, data.cdof))
 
 
+def accelerations(model: mjx.Model, data: mjx.Data) -> Array:
+    """Those of bodies whose joints have none and without gravity, (nbody, 6), as cvel is."""
+    return _summed(_Sums.of(model).moves, data.cdof_dot * data.qvel[:, None])
+
+
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.rne`: `data` with the forces qfrc_bias (nv,) of gravity and velocities."""
     moves, inertia = _Sums.of(model).moves, internal(data).cinert
-    acceleration = _summed(moves, data.cdof_dot * data.qvel[:, None])
+    acceleration = accelerations(model, data)
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         acceleration = acceleration - jnp.concatenate([jnp.zeros(3), model.opt.gravity])
     momentum = _inertia_times(inertia, data.cvel)

@@ -23,7 +23,6 @@ from mjx_drax.physics.mjx_model import (
 )
 
 _DISABLE = mujoco.mjtDisableBit
-_PULLING = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
 
 Change = Callable[[mujoco.MjModel], None]
 
@@ -72,7 +71,6 @@ def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[Differ
     0.7.
     """
     integrator = mujoco.mjtIntegrator(model.opt.integrator).name[len("mjINT_") :].lower()
-    pulling = np.isin(model.eq_type, _PULLING)
     cases: list[tuple[Any, str, Change]] = [
         (
             model.opt.integrator in IMPLICIT,
@@ -108,11 +106,6 @@ def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[Differ
             np.any(model.actuator_damping) or np.any(model.actuator_armature),
             "actuators' own damping and armature are left out: give them to the joints",
             setting("actuator_damping actuator_armature", 0.0),
-        ),
-        (
-            pulling,
-            "connect and weld constraints pull a little differently: prefer joints",
-            setting("eq_active0", False, pulling),
         ),
         (
             model.geom_fluid[:, 0],
