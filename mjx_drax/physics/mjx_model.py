@@ -246,8 +246,8 @@ def _not_collided(model: mujoco.MjModel, without: set[Pair]) -> str:
 OTHER_CONTACTS = {
     tuple(int(getattr(_GEOM, f"mjGEOM_{kind}")) for kind in pair.split())
     for pair in (
-        *("PLANE MESH", "CAPSULE MESH", "BOX MESH", "MESH MESH", "BOX BOX"),
-        *("SPHERE CYLINDER", "CAPSULE CYLINDER", "ELLIPSOID CYLINDER", "CYLINDER CYLINDER"),
+        *("PLANE MESH", "CAPSULE MESH", "BOX MESH", "MESH MESH", "BOX BOX", "CAPSULE BOX"),
+        *("CAPSULE CYLINDER", "ELLIPSOID CYLINDER", "CYLINDER CYLINDER"),
         *("SPHERE ELLIPSOID", "CAPSULE ELLIPSOID", "ELLIPSOID ELLIPSOID"),
         *("HFIELD SPHERE", "HFIELD CAPSULE", "HFIELD BOX", "HFIELD MESH"),
         *("HFIELD ELLIPSOID", "HFIELD CYLINDER", "ELLIPSOID BOX", "ELLIPSOID MESH"),

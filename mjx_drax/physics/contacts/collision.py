@@ -5,6 +5,7 @@
   a tilted box has more contacts there.
 - Capsules on planes have the C engine's directions of friction, along and across the capsule. MJX
   has others where a capsule is steeper than 60 degrees.
+- Spheres on capsules and cylinders, and two capsules, touch where the C engine has it (`spheres`).
 - Meshes on planes touch with the face that the C engine has, where MJX takes corners of the whole
   hull.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
@@ -22,7 +23,7 @@ import contextlib
 import dataclasses
 import itertools
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextvars import ContextVar
 from functools import cache, lru_cache, partial
 from typing import Any
@@ -43,13 +44,13 @@ from mjx_drax.physics._mjx import (
     mjx,
     with_internal,
 )
-from mjx_drax.physics.contacts import curved, polytopes
+from mjx_drax.physics.contacts import curved, polytopes, spheres
 from mjx_drax.physics.engine import mujoco
 
 _GEOM = mujoco.mjtGeom
-PLANE, HFIELD, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
+PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(_GEOM, f"mjGEOM_{kind}"))
-    for kind in ("PLANE", "HFIELD", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
+    for kind in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
 
 SIDES = 16
@@ -537,6 +538,16 @@ def _distinct(collide: Any) -> Any:
     return _function(function, 4)
 
 
+def _of_spheres(collide: Callable[[mjx.Model, mjx.Data, Array], Contacts]) -> Any:
+    """A function of `spheres`, as MJX calls it."""
+
+    def function(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts:
+        dist, pos, normal = collide(model, data, geom)
+        return dist, pos, jax.vmap(make_frame)(normal)
+
+    return _function(function, 1)
+
+
 def _function(collide: Any, contacts: int) -> Any:
     """A function that says, as MJX reads it, how many contacts it makes of a pair."""
 
@@ -557,6 +568,9 @@ _OWN = {
     (PLANE, CAPSULE): plane_capsule,
     (PLANE, BOX): plane_box,
     (PLANE, MESH): plane_mesh,
+    (SPHERE, CAPSULE): _of_spheres(spheres.sphere_capsule),
+    (SPHERE, CYLINDER): _of_spheres(spheres.sphere_cylinder),
+    (CAPSULE, CAPSULE): _of_spheres(spheres.two_capsules),
     (HFIELD, ELLIPSOID): on_height_field,
     (HFIELD, CYLINDER): on_height_field,
     (ELLIPSOID, BOX): _ELLIPSOIDS,

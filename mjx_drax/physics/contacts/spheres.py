@@ -1,0 +1,96 @@
+"""Contacts of spheres with capsules and cylinders, and of two capsules, as the C engine has them.
+
+MJX adds 1e-6 m^2 to the squared length of a capsule, which counts if that is short, and finds
+contacts of cylinders by steps of descent: steps of 2 ms were off by up to 0.7 [m/s, rad/s].
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from mjx_drax.physics._mjx import mjx
+
+PARALLEL = 1e-12
+"""Squared sine of the angle below which capsules count as parallel."""
+
+Contacts = tuple[Array, Array, Array]
+"""Distances (n,), positions (n, 3), and normals (n, 3) from the first geom to the second."""
+
+
+def sphere_capsule(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
+    """The nearest point of the capsule's axis is the centre of a sphere."""
+    sphere, capsule = geom.T
+    centre, radius = data.geom_xpos[sphere], model.geom_size[sphere, 0]
+    middle, half = _axis(model, data, capsule)
+    along = jnp.sum((centre - middle) * half, axis=1) / jnp.sum(half * half, axis=1)
+    nearest = middle + jnp.clip(along, -1.0, 1.0)[:, None] * half
+    return _spheres(centre, radius, nearest, model.geom_size[capsule, 0])
+
+
+def two_capsules(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
+    """Nearest points m + s h of both axes, with -1 <= s <= 1, are centres of spheres.
+
+    At first s of one axis is that of the nearest points of two lines, then each axis gets the s
+    that is nearest to the point of the other one.
+    """
+    one, other = geom.T
+    (m1, h1), (m2, h2) = (_axis(model, data, g) for g in (one, other))
+    apart = m1 - m2
+    a, b, c = (jnp.sum(p * q, axis=1) for p, q in ((h1, h1), (h2, h2), (h1, h2)))
+    d, e = jnp.sum(h1 * apart, axis=1), jnp.sum(h2 * apart, axis=1)
+    area = a * b - c * c
+    crossing = area > PARALLEL * a * b
+    s = jnp.where(crossing, (c * e - b * d) / jnp.where(crossing, area, 1.0), 0.0)
+    t = jnp.clip((c * jnp.clip(s, -1.0, 1.0) + e) / b, -1.0, 1.0)
+    s = jnp.clip((c * t - d) / a, -1.0, 1.0)
+    points = m1 + s[:, None] * h1, m2 + t[:, None] * h2
+    radii = model.geom_size[one, 0], model.geom_size[other, 0]
+    return _spheres(points[0], radii[0], points[1], radii[1])
+
+
+def sphere_cylinder(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
+    """A sphere touches the side, an end or its rim; inside, the nearer one of the first two."""
+    sphere, cylinder = geom.T
+    centre, radius = data.geom_xpos[sphere], model.geom_size[sphere, 0]
+    middle, half = _axis(model, data, cylinder)
+    width, height = model.geom_size[cylinder, 0], model.geom_size[cylinder, 1]
+    axis = half / height[:, None]
+    up = jnp.sum((centre - middle) * axis, axis=1)
+    out = centre - middle - up[:, None] * axis
+    far = _length(out)
+    between, within = jnp.abs(up) < height, far < width
+    nearer = height - jnp.abs(up) < width - far
+    side, end = between & ~(within & nearer), within & ~(between & ~nearer)
+    top = jnp.where(up > 0, 1.0, -1.0)[:, None] * axis
+    rim = middle + height[:, None] * top + out * (width / jnp.where(far > 0, far, 1.0))[:, None]
+    core = jnp.where(side[:, None], middle + up[:, None] * axis, rim)
+    found = _spheres(centre, radius, core, jnp.where(side, width, 0.0))
+    dist = jnp.abs(up) - height - radius
+    flat = dist, centre - (radius + 0.5 * dist)[:, None] * top, -top
+    return tuple(  # type: ignore[return-value]
+        jnp.where(end if one.ndim == 1 else end[:, None], one, other)
+        for one, other in zip(flat, found, strict=True)
+    )
+
+
+def _axis(model: mjx.Model, data: mjx.Data, geom: Array) -> tuple[Array, Array]:
+    """Where the middle of a capsule or cylinder is, and half of its axis from there, (n, 3)."""
+    return data.geom_xpos[geom], data.geom_xmat[geom][..., 2] * model.geom_size[geom, 1, None]
+
+
+def _spheres(one: Array, radius: Array, other: Array, its_radius: Array) -> Contacts:
+    """Contacts of two spheres, halfway between their surfaces."""
+    away = other - one
+    far = _length(away)
+    apart = (far > 0)[:, None]
+    normal = jnp.where(apart, away / jnp.where(apart, far[:, None], 1.0), jnp.eye(3)[0])
+    dist = far - radius - its_radius
+    return dist, one + (radius + 0.5 * dist)[:, None] * normal, normal
+
+
+def _length(v: Array) -> Array:
+    """Of vectors (n, 3), with a derivative of zero where it is zero."""
+    squared = jnp.sum(v * v, axis=1)
+    some = squared > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1.0)), 0.0)
