@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -264,3 +265,18 @@ def outcome(call):
         assert 10 < len(message) <= 600
         assert "\n" not in message
         return error
+
+
+def contacts_of(model):
+    """A function that gives the contacts of MJX where the geoms of `mujoco.MjData` are."""
+    from mjx_drax.physics.contacts.collision import collision, make_data  # MJX: it takes a second
+    from mjx_drax.physics.mjx_model import put_model
+
+    on_device = put_model(model)
+    data = make_data(on_device)
+    find = jax.jit(
+        lambda pos, mat: (
+            collision(on_device, data.replace(geom_xpos=pos, geom_xmat=mat))._impl.contact
+        )
+    )
+    return lambda at: find(jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3))

@@ -33,12 +33,13 @@ def with_turning(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if int(model.opt.disableflags) & _OFF or not np.isin(kinds, (_CONNECT, _WELD)).any():
         return data
     connects, welds = np.flatnonzero(kinds == _CONNECT), np.flatnonzero(kinds == _WELD)
+    cacc, anchors = accelerations(model, data), model.eq_data[:, :6]
     rates = [
-        _between_points(model, data, connects, model.eq_data[connects, :6]),
+        _between_points(model, data, cacc, connects, anchors[connects]),
         jnp.concatenate(
             [
-                _between_points(model, data, welds, jnp.roll(model.eq_data[welds, :6], 3, axis=1)),
-                _between_frames(model, data, welds),
+                _between_points(model, data, cacc, welds, jnp.roll(anchors[welds], 3, axis=1)),
+                _between_frames(model, data, cacc, welds),
             ],
             axis=1,
         ),
@@ -49,7 +50,9 @@ def with_turning(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return with_internal(data, efc_aref=aref)
 
 
-def _between_points(model: mjx.Model, data: mjx.Data, which: np.ndarray, anchors: Array) -> Array:
+def _between_points(
+    model: mjx.Model, data: mjx.Data, cacc: Array, which: np.ndarray, anchors: Array
+) -> Array:
     """p1'' - p2'' of constraints (n,), (n, 3); anchors of both bodies (n, 6), if not of sites."""
     found = []
     for ids, bodies, anchor in zip(*_ends(model, which), jnp.split(anchors, 2, 1), strict=True):
@@ -59,13 +62,13 @@ def _between_points(model: mjx.Model, data: mjx.Data, which: np.ndarray, anchors
             point = jnp.where(of_site[:, None], data.site_xpos[ids * of_site], point)
         arm = point - data.subtree_com[np.asarray(model.body_rootid)[bodies]]
         w, v = jnp.split(data.cvel[bodies], 2, axis=1)
-        turning, moving = jnp.split(accelerations(model, data)[bodies], 2, axis=1)
+        turning, moving = jnp.split(cacc[bodies], 2, axis=1)
         velocity = v + jnp.cross(w, arm)
         found.append(moving + jnp.cross(turning, arm) + jnp.cross(w, velocity))
     return found[0] - found[1]
 
 
-def _between_frames(model: mjx.Model, data: mjx.Data, which: np.ndarray) -> Array:
+def _between_frames(model: mjx.Model, data: mjx.Data, cacc: Array, which: np.ndarray) -> Array:
     """s vec(q2* b q1) / 2 of weld constraints (n,), (n, 3)."""
     ids, (one, other) = _ends(model, which)
     within = [model.eq_data[which, 6:10], jnp.eye(4)[np.zeros(len(which), int)]]
@@ -75,9 +78,7 @@ def _between_frames(model: mjx.Model, data: mjx.Data, which: np.ndarray) -> Arra
         within = [jnp.where(of_site[:, None], s, q) for s, q in zip(sites, within, strict=True)]
     q1 = quaternion.multiply(data.xquat[one], within[0])
     q2 = quaternion.multiply(data.xquat[other], within[1])
-    velocity, acceleration = (
-        jnp.pad(each[:, :3], ((0, 0), (1, 0))) for each in (data.cvel, accelerations(model, data))
-    )
+    velocity, acceleration = (jnp.pad(each[:, :3], ((0, 0), (1, 0))) for each in (data.cvel, cacc))
     w1, w2 = velocity[one], velocity[other]
     b = quaternion.multiply(w1 - w2, w1) - quaternion.multiply(w2, w1 - w2)
     b = acceleration[one] - acceleration[other] + 0.5 * b

@@ -242,7 +242,10 @@ class Source:
 
 
 def _folders(path: Path) -> list[Path]:
-    """Where a file of MJCF lies, and models that it attaches, also by files that it includes."""
+    """Where a file of MJCF lies, and models that it attaches, also by files that it includes.
+
+    What an included file names lies where it would if it stood in the whole one.
+    """
     found = [path.parent]
     try:
         elements = list(ElementTree.parse(path).getroot().iter())
@@ -251,7 +254,8 @@ def _folders(path: Path) -> list[Path]:
     for element in elements:
         other = path.parent / element.get("file", "")
         if element.tag in ("model", "include") and other.is_file():
-            found += _folders(other)
+            own, *attached = _folders(other)
+            found += [own, *attached] if element.tag == "model" else attached
     return list(dict.fromkeys(found))
 
 

@@ -109,6 +109,19 @@ def test_a_model_that_attaches_another_is_written_with_the_meshes_of_both(tmp_pa
     np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
 
 
+def test_files_that_an_included_file_names_are_where_mujoco_finds_them(tmp_path):
+    (tmp_path / "sub").mkdir()
+    part = '<mujocoinclude><asset><mesh name="m" file="m.obj"/></asset></mujocoinclude>'
+    (tmp_path / "sub" / "part.xml").write_text(part)
+    (tmp_path / "sub" / "m.obj").write_text(CORNERS.format(0.1))
+    (tmp_path / "m.obj").write_text(CORNERS.format(0.2))
+    body = '<worldbody><body><joint/><geom type="mesh" mesh="m"/></body></worldbody>'
+    (tmp_path / "whole.xml").write_text(f'<mujoco><include file="sub/part.xml"/>{body}</mujoco>')
+    model = load(tmp_path / "whole.xml", "torque")
+    again = Source.of(tmp_path / "whole.xml", model, "torque").compiled()
+    np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
+
+
 def test_files_of_one_name_in_two_models_are_not_confused(tmp_path):
     (tmp_path / "part" / "meshes").mkdir(parents=True)
     (tmp_path / "meshes").mkdir()

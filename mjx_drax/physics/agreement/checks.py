@@ -32,7 +32,7 @@ from mjx_drax.physics.actuators import control_ranges, disabled
 from mjx_drax.physics.agreement.differences import PARTS, Change, differences, disabling, set_aside
 from mjx_drax.physics.c_engine.states import Engine, integrate, quiet, set_state, stopped_at_once
 from mjx_drax.physics.contacts.collision import corners, hulls_of_one_size
-from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
+from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, touching
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
 from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, has_limits, put_model
@@ -316,9 +316,9 @@ def compare(
     """
     engine, joints, nv = Engine(model, contacts), Joints.of(model), model.nv
     ndx = 2 * nv + model.na
-    touching = set(contact_pairs(model)) - left_out(model, contacts)
-    largest = max((corners(model, g) for pair in touching for g in pair), default=0)
-    as_one = hulls_of_one_size() if len(touching) * largest**2 < PADDED else nullcontext()
+    pairs = touching(model, contacts)
+    largest = max((corners(model, g) for pair in pairs for g in pair), default=0)
+    as_one = hulls_of_one_size() if len(pairs) * largest**2 < PADDED else nullcontext()
     with jax.enable_x64(True), as_one:
         on_device = put_model(model, contacts, bounded)
 
@@ -477,7 +477,7 @@ def causes(
     error: float,
 ) -> str:
     """Why the velocities of a step have an error, as far as comparing without a cause tells."""
-    kept = set(contact_pairs(model)) - left_out(model, contacts)
+    kept = touching(model, contacts)
 
     def error_without(*changes: Change) -> float:
         changed = copy.deepcopy(model)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, left_out
+from mjx_drax.physics.contacts.pairs import Contacts, geom_name, touching
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjx_model import (
     IMPLICIT,
@@ -119,7 +119,7 @@ def differences(model: mujoco.MjModel, contacts: Contacts = True) -> list[Differ
         ),
     ]
     found = [Difference(text, without) for condition, text, without in cases if np.any(condition)]
-    for a, b in sorted(set(contact_pairs(model)) - left_out(model, contacts)):
+    for a, b in sorted(touching(model, contacts)):
         if (int(model.geom_type[a]), int(model.geom_type[b])) in OTHER_CONTACTS:
             sentence = (
                 f"contacts like that of {geom_name(model, a)!r} with {geom_name(model, b)!r} "

@@ -401,8 +401,8 @@ def corners(model: mujoco.MjModel, g: int) -> int:
 def hull_of(model: mujoco.MjModel, which: int) -> ConvexMesh | None:
     """The hull of a mesh, on the corners that the C engine has; None if it is flat."""
     graph = model.mesh_graph[model.mesh_graphadr[which] :]
-    corners = graph[2 + graph[0] : 2 + 2 * graph[0]]
-    vertices = model.mesh_vert[model.mesh_vertadr[which] + corners]
+    own = graph[2 + graph[0] : 2 + 2 * graph[0]]
+    vertices = model.mesh_vert[model.mesh_vertadr[which] + own]
     try:
         return _polytope_of(np.asarray(vertices, float).tobytes())
     except QhullError:

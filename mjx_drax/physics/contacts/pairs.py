@@ -32,6 +32,11 @@ def contact_pairs(model: mujoco.MjModel) -> Iterator[Pair]:
         yield from ((int(a), int(b)) for a, b, _ in geom_pairs(model))
 
 
+def touching(model: mujoco.MjModel, contacts: Contacts) -> set[Pair]:
+    """The pairs of geoms that a plan with these `contacts` has contacts of."""
+    return set(contact_pairs(model)) - left_out(model, contacts)
+
+
 def left_out(model: mujoco.MjModel, contacts: Contacts) -> set[Pair]:
     """The pairs of geoms that may touch and of which a plan with these `contacts` has none.
 

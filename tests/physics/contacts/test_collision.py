@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from builders import contacts_of
 
 from mjx_drax.physics._mjx import COLLISIONS, collision_driver, mjx
 from mjx_drax.physics.contacts import polytopes
@@ -25,18 +26,6 @@ BOX = """
     <body><freejoint/><geom type="box" size="0.1 0.2 0.3" margin="0.02"/></body>
   </worldbody>
 </mujoco>"""
-
-
-def contacts_of(model):
-    """A function that gives the contacts of MJX where the geoms of `mujoco.MjData` are."""
-    on_device = put_model(model)
-    data = make_data(on_device)
-    find = jax.jit(
-        lambda pos, mat: (
-            collision(on_device, data.replace(geom_xpos=pos, geom_xmat=mat))._impl.contact
-        )
-    )
-    return lambda at: find(jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3))
 
 
 def assert_touch_alike(model, found, wanted, atol):

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from builders import contacts_of
 
 from mjx_drax.physics.contacts import spheres
-from mjx_drax.physics.contacts.collision import collision, make_data
+from mjx_drax.physics.contacts.collision import make_data
 from mjx_drax.physics.mjx_model import put_model
 
 PAIR = """
@@ -41,18 +42,12 @@ def paired(one, other):
 def test_they_touch_as_in_the_c_engine_also_deep_inside(one, other):
     model, rng, seen = paired(one, other), np.random.default_rng(0), []
     with jax.enable_x64(True):
-        on_device, at = put_model(model), mujoco.MjData(model)
-        data = make_data(on_device)
-        found = jax.jit(
-            lambda pos, mat: (
-                collision(on_device, data.replace(geom_xpos=pos, geom_xmat=mat))._impl.contact
-            )
-        )
+        find, at = contacts_of(model), mujoco.MjData(model)
         for _ in range(400):
             at.qpos[:] = rng.normal(size=14)
             at.qpos[:3], at.qpos[7:10] = 0.0, rng.uniform(-0.2, 0.2, 3)
             mujoco.mj_forward(model, at)
-            contact = found(at.geom_xpos, at.geom_xmat.reshape(-1, 3, 3))
+            contact = find(at)
             assert (contact.dist[0] < 0.01) == (at.ncon == 1)
             if at.ncon:
                 seen.append(at.contact.dist[0])
