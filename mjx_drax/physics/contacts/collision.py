@@ -5,7 +5,8 @@
   a tilted box has more contacts there.
 - Capsules on planes have the C engine's directions of friction, along and across the capsule. MJX
   has others where a capsule is steeper than 60 degrees.
-- Spheres on capsules and cylinders, and two capsules, touch where the C engine has it (`spheres`).
+- Spheres on capsules and cylinders, and two capsules, touch where the C engine has it (`spheres`),
+  and so do spheres and capsules on boxes (`boxes`).
 - Meshes on planes touch with the face that the C engine has, where MJX takes corners of the whole
   hull.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
@@ -44,7 +45,7 @@ from mjx_drax.physics._mjx import (
     mjx,
     with_internal,
 )
-from mjx_drax.physics.contacts import curved, polytopes, spheres
+from mjx_drax.physics.contacts import boxes, curved, polytopes, spheres
 from mjx_drax.physics.engine import mujoco
 
 _GEOM = mujoco.mjtGeom
@@ -538,14 +539,16 @@ def _distinct(collide: Any) -> Any:
     return _function(function, 4)
 
 
-def _of_spheres(collide: Callable[[mjx.Model, mjx.Data, Array], Contacts]) -> Any:
-    """A function of `spheres`, as MJX calls it."""
+def _of_spheres(
+    collide: Callable[[mjx.Model, mjx.Data, Array], Contacts], contacts: int = 1
+) -> Any:
+    """A function of `spheres` or `boxes`, as MJX calls it."""
 
     def function(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts:
         dist, pos, normal = collide(model, data, geom)
         return dist, pos, jax.vmap(make_frame)(normal)
 
-    return _function(function, 1)
+    return _function(function, contacts)
 
 
 def _function(collide: Any, contacts: int) -> Any:
@@ -570,7 +573,9 @@ _OWN = {
     (PLANE, MESH): plane_mesh,
     (SPHERE, CAPSULE): _of_spheres(spheres.sphere_capsule),
     (SPHERE, CYLINDER): _of_spheres(spheres.sphere_cylinder),
+    (SPHERE, BOX): _of_spheres(boxes.sphere_box),
     (CAPSULE, CAPSULE): _of_spheres(spheres.two_capsules),
+    (CAPSULE, BOX): _of_spheres(boxes.capsule_box, 2),
     (HFIELD, ELLIPSOID): on_height_field,
     (HFIELD, CYLINDER): on_height_field,
     (ELLIPSOID, BOX): _ELLIPSOIDS,

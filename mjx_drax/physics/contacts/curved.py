@@ -40,6 +40,9 @@ the rim of its end; below the second it touches at the lowest line of its side t
 CORE, STEPS = 0.2, 12
 """How much smaller the core of a cylinder is than its smaller size; steps towards it."""
 
+TIE = 1e-7
+"""A rim or a corner touches elsewhere only if that gap is larger by this [m]; else by a face."""
+
 SEGMENTS = np.array(list(itertools.combinations(range(4), 2)))
 TRIANGLES = np.array(list(itertools.combinations(range(4), 3)))
 """Corners of the edges and faces of a simplex."""
@@ -79,7 +82,7 @@ def cylinder(centre: Array, turn: Array, size: Array, hull: ConvexMesh) -> Conta
     edges = _between(crossed, hull.edge_face_normal)
     allowed = jnp.concatenate([jnp.ones(len(normals), bool), edges, jnp.ones(3, bool)])
     gaps = jnp.where(allowed, lowest(directions) - highest, -jnp.inf)
-    best = jnp.argmax(gaps)
+    best = jnp.argmax(gaps.at[-1].add(-TIE))
     d, gap, top = directions[best], gaps[best], highest[best]
 
     # Points of the cylinder inside of the polytope: on the rim of the lower end, or of its side
@@ -98,6 +101,7 @@ def cylinder(centre: Array, turn: Array, size: Array, hull: ConvexMesh) -> Conta
     corners = across & (jnp.abs(far @ axis) <= half)
     # Where an edge crosses the side; or, without any other, the lowest or the highest point
     crosses = (best >= len(normals)) & (best < len(normals) + len(start))
+    one = crosses | (best == len(directions) - 1)
     e = jnp.clip(best - len(normals), 0, len(start) - 1)
     lowest_point = below - radius * _unit(_across(d, axis))
     of_rim = (jnp.abs(along) > 1.0 - LIES**2) & (jnp.abs(along) < LIES)
@@ -111,8 +115,8 @@ def cylinder(centre: Array, turn: Array, size: Array, hull: ConvexMesh) -> Conta
     points = jnp.concatenate([own, hull.vert, meeting[None]])
     depth = jnp.concatenate([own @ d - top, jnp.broadcast_to(lowest(d), len(far) + 1)])
     depth = depth.at[len(own) :].add(-(points[len(own) :] @ d))
-    acts = jnp.concatenate([inside & used, corners, jnp.zeros(1, bool)]) & (depth < 0)
-    acts = acts.at[-1].set(crosses | ~jnp.any(acts))
+    acts = jnp.concatenate([inside & used, corners, jnp.zeros(1, bool)]) & (depth < 0) & ~one
+    acts = acts.at[-1].set(~jnp.any(acts))
     depth = depth.at[-1].set(gap)
     chosen = four_of(points, acts, d)
     repeated = jnp.any(jnp.tril(chosen == chosen[:, None], -1), axis=1)

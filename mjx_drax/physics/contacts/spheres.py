@@ -29,22 +29,11 @@ def sphere_capsule(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
 
 
 def two_capsules(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
-    """Nearest points m + s h of both axes, with -1 <= s <= 1, are centres of spheres.
-
-    At first s of one axis is that of the nearest points of two lines, then each axis gets the s
-    that is nearest to the point of the other one.
-    """
+    """Nearest points m + s h of both axes, with -1 <= s <= 1, are centres of spheres."""
     one, other = geom.T
     (m1, h1), (m2, h2) = (_axis(model, data, g) for g in (one, other))
-    apart = m1 - m2
-    a, b, c = (jnp.sum(p * q, axis=1) for p, q in ((h1, h1), (h2, h2), (h1, h2)))
-    d, e = jnp.sum(h1 * apart, axis=1), jnp.sum(h2 * apart, axis=1)
-    area = a * b - c * c
-    crossing = area > PARALLEL * a * b
-    s = jnp.where(crossing, (c * e - b * d) / jnp.where(crossing, area, 1.0), 0.0)
-    t = jnp.clip((c * jnp.clip(s, -1.0, 1.0) + e) / b, -1.0, 1.0)
-    s = jnp.clip((c * t - d) / a, -1.0, 1.0)
-    points = m1 + s[:, None] * h1, m2 + t[:, None] * h2
+    _, s, t, _ = nearest(m1 - m2, h1, h2)
+    points = m1 + jnp.clip(s, -1.0, 1.0)[:, None] * h1, m2 + t[:, None] * h2
     radii = model.geom_size[one, 0], model.geom_size[other, 0]
     return _spheres(points[0], radii[0], points[1], radii[1])
 
@@ -58,7 +47,7 @@ def sphere_cylinder(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
     axis = half / height[:, None]
     up = jnp.sum((centre - middle) * axis, axis=1)
     out = centre - middle - up[:, None] * axis
-    far = _length(out)
+    far = length(out)
     between, within = jnp.abs(up) < height, far < width
     nearer = height - jnp.abs(up) < width - far
     side, end = between & ~(within & nearer), within & ~(between & ~nearer)
@@ -74,6 +63,25 @@ def sphere_cylinder(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
     )
 
 
+def nearest(apart: Array, one: Array, other: Array) -> tuple[Array, Array, Array, Array]:
+    """Where segments with halves h1, h2 (..., 3), whose middles are m1 - m2 apart, are nearest.
+
+    At first s of the first one is that of the nearest points of two lines, then each segment gets
+    the s, of [-1, 1], that is nearest to the point of the other one.
+
+    Returns:
+        s of the line of the first segment (...), s and t of both segments, of which s may be
+        beyond its ends still, and whether they are parallel, where the first s is 0.
+    """
+    a, b, c = (jnp.sum(p * q, axis=-1) for p, q in ((one, one), (other, other), (one, other)))
+    d, e = jnp.sum(one * apart, axis=-1), jnp.sum(other * apart, axis=-1)
+    area = a * b - c * c
+    crossing = area > max(PARALLEL, float(jnp.finfo(area.dtype).eps)) * a * b
+    of_line = jnp.where(crossing, (c * e - b * d) / jnp.where(crossing, area, 1.0), 0.0)
+    t = jnp.clip((c * jnp.clip(of_line, -1.0, 1.0) + e) / b, -1.0, 1.0)
+    return of_line, (c * t - d) / a, t, ~crossing
+
+
 def _axis(model: mjx.Model, data: mjx.Data, geom: Array) -> tuple[Array, Array]:
     """Where the middle of a capsule or cylinder is, and half of its axis from there, (n, 3)."""
     return data.geom_xpos[geom], data.geom_xmat[geom][..., 2] * model.geom_size[geom, 1, None]
@@ -82,14 +90,14 @@ def _axis(model: mjx.Model, data: mjx.Data, geom: Array) -> tuple[Array, Array]:
 def _spheres(one: Array, radius: Array, other: Array, its_radius: Array) -> Contacts:
     """Contacts of two spheres, halfway between their surfaces."""
     away = other - one
-    far = _length(away)
+    far = length(away)
     apart = (far > 0)[:, None]
     normal = jnp.where(apart, away / jnp.where(apart, far[:, None], 1.0), jnp.eye(3)[0])
     dist = far - radius - its_radius
     return dist, one + (radius + 0.5 * dist)[:, None] * normal, normal
 
 
-def _length(v: Array) -> Array:
+def length(v: Array) -> Array:
     """Of vectors (n, 3), with a derivative of zero where it is zero."""
     squared = jnp.sum(v * v, axis=1)
     some = squared > 0

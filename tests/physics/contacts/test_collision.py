@@ -162,6 +162,27 @@ def test_cylinders_and_ellipsoids_meet_boxes_and_meshes_as_in_the_c_engine(
     assert np.quantile(normals, 0.2) > 0.99
 
 
+def test_the_side_of_a_cylinder_touches_an_edge_once_as_in_the_c_engine():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="box" size=".1 .12 .08"/>
+        <body><freejoint/><geom type="cylinder" size=".06 .1"/></body></worldbody></mujoco>"""
+    )
+    wanted = mujoco.MjData(model)
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for depth in (0.001, 0.003):
+            away = (0.06 - depth) * np.array([0.6, 0, 0.8])
+            # The axis leans over the edge along y, at an angle with it
+            wanted.qpos[:3], wanted.qpos[3:] = np.array([0.1, 0.01, 0.08]) + away, [1, 0.9, 0.3, 0]
+            axis = np.cross(away, [0.6, 1.0, -0.45])
+            mujoco.mju_quatZ2Vec(wanted.qpos[3:], axis / np.linalg.norm(axis))
+            mujoco.mj_forward(model, wanted)
+            found = find(wanted)
+            assert wanted.ncon == 1
+            assert np.sum(found.dist < 0) == 1
+            np.testing.assert_allclose(found.dist.min(), wanted.contact.dist[0], atol=1e-6)
+
+
 def test_two_boxes_touch_at_every_point_once():
     model = meeting("box", BOXES)
     with jax.enable_x64(True):

@@ -1,0 +1,101 @@
+"""Contacts of spheres and capsules with boxes, against those of MuJoCo's C engine."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from builders import contacts_of
+
+from mjx_drax.physics.contacts import boxes
+from mjx_drax.physics.contacts.collision import make_data
+from mjx_drax.physics.mjx_model import put_model
+
+PAIR = """
+<mujoco><worldbody>
+  <body><freejoint/><geom name="one" type="{}" size="{}" margin="0.01"/></body>
+  <body><freejoint/><geom name="other" type="box" size="{}"/></body>
+</worldbody></mujoco>"""
+SIZES = {"sphere": ".1", "capsule": ".06 .15"}
+BOX = ".1 .15 .07"
+
+
+def paired(one, size=None, box=BOX):
+    return mujoco.MjModel.from_xml_string(PAIR.format(one, size or SIZES[one], box))
+
+
+def assert_same(found, at, atol=1e-12):
+    """The contacts that act are the C engine's, in any order."""
+    acts = np.asarray(found.dist) < 0.01
+    assert acts.sum() == at.ncon
+    here = np.c_[found.dist, found.pos, np.reshape(found.frame, (-1, 9))][acts]
+    there = np.c_[at.contact.dist, at.contact.pos, at.contact.frame]
+    order = [np.lexsort(np.round(rows[:, :4].T, 5)) for rows in (here, there)]
+    np.testing.assert_allclose(here[order[0]], there[order[1]], atol=atol)
+
+
+@pytest.mark.parametrize(
+    ("one", "size", "box"),
+    [
+        ("sphere", ".1", BOX),
+        ("capsule", ".06 .15", BOX),
+        ("capsule", ".01 .4", ".1 .15 .07"),  # longer than the box is wide
+        ("capsule", ".03 .02", ".2 .2 .002"),  # on a thin plate
+    ],
+)
+def test_they_touch_as_in_the_c_engine_also_deep_inside(one, size, box):
+    model, rng, seen = paired(one, size, box), np.random.default_rng(0), []
+    with jax.enable_x64(True):
+        find, at = contacts_of(model), mujoco.MjData(model)
+        for _ in range(500):
+            at.qpos[:] = rng.normal(size=14)
+            at.qpos[:3], at.qpos[7:10] = 0.0, rng.uniform(-0.2, 0.2, 3)
+            mujoco.mj_forward(model, at)
+            assert_same(find(at), at)
+            seen.extend(at.contact.dist)
+    assert len(seen) > 100
+    assert min(seen) < -0.01
+
+
+@pytest.mark.parametrize("turn", [(1, 0, 0, 0), (1, 1, 0, 0), (1, 0, 1, 0), (1, 0.3, 0, 0)])
+@pytest.mark.parametrize("x64", [True, False])
+def test_a_capsule_that_is_parallel_to_sides_of_a_box_touches_in_the_same_points(turn, x64):
+    model, rng = paired("capsule"), np.random.default_rng(0)
+    with jax.enable_x64(x64):
+        find, at = contacts_of(model), mujoco.MjData(model)
+        for _ in range(100):
+            at.qpos[:] = 0.0
+            at.qpos[:3], at.qpos[3:7], at.qpos[10] = rng.uniform(-0.25, 0.25, 3), turn, 1.0
+            mujoco.mj_forward(model, at)
+            if not at.ncon or np.abs(at.contact.dist - 0.01).min() < 1e-6:
+                continue
+            if x64:
+                assert_same(find(at), at)
+            else:  # in either order of the ends, and of faces that are equally near
+                found = find(at)
+                acts = np.asarray(found.dist) < 0.01
+                assert acts.sum() == at.ncon
+                np.testing.assert_allclose(
+                    np.sort(np.asarray(found.dist)[acts]), np.sort(at.contact.dist), atol=1e-6
+                )
+
+
+@pytest.mark.parametrize("one", ["sphere", "capsule"])
+@pytest.mark.parametrize(
+    "apart",
+    [[0, 0, 0], [0.1, 0, 0], [0, 0, 0.13], [0.15, 0.15, 0.2], [0.1, 0.15, 0.22], [0, 0, 0.07]],
+)
+def test_in_symmetric_poses_derivatives_are_finite(one, apart):
+    model = paired(one)
+    on_device, at = put_model(model), mujoco.MjData(model)
+    at.qpos[7:10] = apart
+    mujoco.mj_kinematics(model, at)
+    data = make_data(on_device)
+    collide = {"sphere": boxes.sphere_box, "capsule": boxes.capsule_box}[one]
+
+    def of(pos, mat):
+        return collide(on_device, data.replace(geom_xpos=pos, geom_xmat=mat), jnp.array([[0, 1]]))
+
+    pose = jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3)
+    for derivative in jax.tree.leaves(jax.jacfwd(of, (0, 1))(*pose)):
+        assert np.isfinite(derivative).all()
