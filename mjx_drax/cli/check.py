@@ -10,6 +10,7 @@ import argparse
 import json
 import sys
 
+from mjx_drax.base.files import json_data
 from mjx_drax.cli.common import say
 
 
@@ -44,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
         options.contacts or True,
         options.actuators,
     )
-    say(json.dumps(report, indent=1) if options.json else text(report))
+    say(json.dumps(json_data(report), indent=1) if options.json else text(report))
     return 0 if report["obstacle"] is None else 1
 
 

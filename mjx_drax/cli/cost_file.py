@@ -103,6 +103,7 @@ def _module(path: Path) -> ModuleType:
             f"the cost file {str(path)!r} is not a Python file: its name must end in .py."
         )
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look there
     sys.path.insert(0, str(path.resolve().parent))
     try:
         spec.loader.exec_module(module)

@@ -187,7 +187,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
         chains,
         options.seed,
         solver,
-        progress=not options.quiet,
+        progress=False if options.quiet else None,
         record=record,
         checkpoint=options.checkpoint,
         tolerances=tolerances,

@@ -268,15 +268,15 @@ class MPC:
                 f"preconditioner is {type(metric).__name__}, which brings no feedback gains: give "
                 "GaussNewton(), or a metric with has_gains = True."
             )
-        if iterations > self.solver.flow.tail:
-            raise DraxError(
-                f"iterations is {iterations}, but the solver's tail has {self.solver.flow.tail}: "
-                "give fewer, or a longer tail."
-            )
         polish = self.solver.polish
         self._polish: Polish | None = None
         if polish is not None and polish.iterations and is_constrained(problem):
             self._polish = replace(polish, iterations=ENDLESS)
+        elif iterations > self.solver.flow.tail:
+            raise DraxError(
+                f"iterations is {iterations}, but the solver's tail has {self.solver.flow.tail}: "
+                "give fewer, or a longer tail."
+            )
         self.chains, self.explorers = chains, int(explorers)
         self.iterations, self.every, self.seed = iterations, every, seed
         self.statistics = Statistics()
@@ -394,7 +394,7 @@ class MPC:
             planned = self._between(plan.x[k], plan.x[k + 1], s - k)[: len(x)]
             own, applied = further, self._applied
             if applied is not None and applied.any:  # rates are counted from what was applied
-                v = applied.before(plan.time + k * step, self._step)
+                v = applied.before(plan.time + k * step, step)
                 own = np.append(further[: len(further) - len(v)], v)
             off = dynamics.host_difference(np.append(x, own), np.append(planned, further))
             u = u + plan.gains[k] @ off

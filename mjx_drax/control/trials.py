@@ -86,7 +86,7 @@ def simulate(
             if realtime:
                 time.sleep(max(0.0, began + plant.time - time.perf_counter()))
     end = states[-1]
-    reached = policy.problem.reached(end) if np.isfinite(end).all() else False
+    reached = policy.problem.reached(end, plant.time) if np.isfinite(end).all() else False
     found = np.array(times), np.array(states), np.array(controls)
     return Motion(*found, policy.statistics, reached, pushes, np.array(further))
 
@@ -143,6 +143,7 @@ class Trials:
         """What `mpc.json` holds. Costs are those of the problem, summed over the steps driven."""
         policy, runs = self.policy, [m.statistics for m in self.motions]
         latencies = np.concatenate([s.latencies for s in runs])
+        some = len(latencies) > 0
         judged = [m.reached for m in self.motions if m.reached is not None]
         driven = [_cost(policy, m) for m in self.motions]
         return {
@@ -159,8 +160,10 @@ class Trials:
             "duration": self.duration,
             "first_solve_s": policy.first_solve,
             "plans": len(latencies),
-            "plans_per_s": float(1.0 / latencies.mean()),
-            "latency_s": {f"p{p}": float(np.percentile(latencies, p)) for p in PERCENTILES},
+            "plans_per_s": float(1.0 / latencies.mean()) if some else None,
+            "latency_s": {
+                f"p{p}": float(np.percentile(latencies, p)) if some else None for p in PERCENTILES
+            },
             "failed_plans": sum(s.failed for s in runs),
             "switches": sum(s.switches for s in runs),
             "runs": len(self.motions),
@@ -195,7 +198,11 @@ def _total(problem: Problem, x: jax.Array, u: jax.Array, end: jax.Array) -> jax.
 
 def lines(numbers: dict[str, Any]) -> list[str]:
     """The summary for a person."""
-    latency = ", ".join(f"{p} {1e3 * s:.1f}" for p, s in numbers["latency_s"].items())
+    rate = "no further plans"
+    latency = "none"
+    if numbers["plans"]:
+        rate = f"{numbers['plans_per_s']:.1f} plans/s"
+        latency = ", ".join(f"{p} {1e3 * s:.1f}" for p, s in numbers["latency_s"].items()) + " ms"
     waits = "in real time" if numbers["realtime"] else "the plant waits for each plan"
     share = numbers["success_rate"]
     count = sum(map(len, numbers["pushes"]))
@@ -205,8 +212,8 @@ def lines(numbers: dict[str, Any]) -> list[str]:
         else (f"{numbers['reached']} of {numbers['runs']} end in the goal ({share:.0%})")
     )
     return [
-        f"rate      {numbers['plans_per_s']:.1f} plans/s on {numbers['device']}; {waits}",
-        f"latency   {latency} ms over {numbers['plans']} plans, {numbers['failed_plans']} failed",
+        f"rate      {rate} on {numbers['device']}; {waits}",
+        f"latency   {latency} over {numbers['plans']} plans, {numbers['failed_plans']} failed",
         f"cost      {numbers['cost']:.4g} a run of {numbers['duration']:g} s, on average",
         f"runs      {outcome}; {count} pushes in all",
     ]

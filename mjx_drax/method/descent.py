@@ -1,7 +1,7 @@
 """What a chain takes of a direction: line search, Metropolis test, damping, bounds' multipliers.
 
 With Gauss-Newton the noise-free tail is sequential quadratic programming, and it is what brings
-max|h| to rounding level. The step size is the one that lowers L_mu most, from a short geometric
+max|h| to rounding level. The step size is the one with the least L_mu, from a short geometric
 ladder evaluated in one batch. Each chain adapts its damping as Levenberg and Marquardt do, less
 after a full step and more after a short one.
 """
@@ -85,9 +85,10 @@ def line_search(
     drift: Trajectory,
     ladder: tuple[float, ...],
 ) -> tuple[Trajectory, Array, Info]:
-    """X + alpha d, alpha and diagnostics, for the alpha of the ladder with the least L_mu.
+    """X + alpha d, alpha and diagnostics, for the alpha > 0 of the ladder with the least L_mu.
 
-    The ladder's last size is 0: if nothing is lower and finite, the chain stands still.
+    L_mu may rise by it. The ladder's last size is 0: where no other leads to finite numbers, the
+    chain stands still.
     """
 
     def candidate(alpha: Array) -> tuple[Array, tuple[Trajectory, Array, Info]]:

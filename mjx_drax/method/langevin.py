@@ -6,8 +6,8 @@ While noise is on (Kurtz and Burdick, with the metric M of `metrics`):
     lambda <- lambda + alpha r,                       r = 2 mu h  (GaussNewton: mu (h + J d))
 
 While sigma > 0 knots leave the dynamics and wander between basins; the multipliers pull them back
-onto h = 0 as sigma falls. The noise-free tail takes the step X <- X + alpha d with the alpha that
-lowers L_mu most (`descent`).
+onto h = 0 as sigma falls. The noise-free tail takes the step X <- X + alpha d with the alpha for
+which L_mu is least (`descent`).
 
 `init` gives the State that a chain carries, `step` moves it on and gives diagnostics. A chain that
 turns non-finite is frozen where it last was finite and marked as diverged.

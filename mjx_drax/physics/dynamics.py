@@ -335,11 +335,13 @@ class MjxDynamics(Dynamics):
         """What steppers leave for the next."""
         return Spare()
 
-    def configured(self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any]) -> None:
-        """Give every chain of a stepper its time between knots [s] and its parameters."""
+    def configured(
+        self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any] | None
+    ) -> None:
+        """Give every chain of a stepper its time between knots [s] and parameters; None: as are."""
         steps = dt / self.substeps if self.free_step else None
         own: dict[str, np.ndarray] = {}
-        if self.numbers is not None:
+        if self.numbers is not None and parameters is not None:
             with jax.enable_x64(True):
                 model = jax.tree.map(jnp.asarray, self.in_float64().model)
                 found = jax.vmap(partial(self.numbers, model))(dict(parameters))

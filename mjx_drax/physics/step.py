@@ -13,7 +13,7 @@ Seven things differ from `mjx.step`. Only the last three change values:
 - The forces of springs on ball and free joints use the same quaternions.
 - Sums along the tree of bodies are computed by `tree`, without a loop over its levels, and the
   inertia M is dense and factorized by `linalg`.
-- Boxes on planes have the contacts of the C engine; see `collision`.
+- Contacts are those of `contacts.collision`.
 - The integrator implicitfast has the C engine's derivative of forces by velocities.
 - Connect and weld constraints have the C engine's references while bodies turn; see `equalities`.
 """

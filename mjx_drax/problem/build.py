@@ -16,7 +16,7 @@ from mjx_drax.base.errors import DraxError, DraxWarning, require_positive, requi
 from mjx_drax.base.numbers import vector
 from mjx_drax.problem.choices import Choices, extend, phases_of
 from mjx_drax.problem.cost import as_partial, constraint_of, cost_of, takes_knot
-from mjx_drax.problem.data import rows
+from mjx_drax.problem.data import require_rows, rows
 from mjx_drax.problem.dynamics import Dynamics, FunctionDynamics
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import require_functions
@@ -175,6 +175,16 @@ def from_function(
     named = {"x_names": _names("x_names", x_names, nx), "u_names": _names("u_names", u_names, nu)}
     if isinstance(f, Dynamics):
         dynamics = f
+        if phases and type(f).at is Dynamics.at:
+            raise DraxError(
+                f"the horizon is free, and {type(f).__name__} always takes the same step: give it "
+                "a method at(knot), which returns the same system with dt = knot.dt."
+            )
+        if not phases and not np.isclose(dt, float(f.dt), rtol=1e-6):
+            raise DraxError(
+                f"knots are {dt:.6g} s apart by dt, horizon and knots, and the step of "
+                f"{type(f).__name__} is {float(f.dt):.6g} s: give the same."
+            )
         for label, value in named.items():
             if value:
                 raise DraxError(
@@ -267,11 +277,8 @@ def assembled(
     for label, function in given.items():
         if function is not None:
             _require_knots(as_partial(function), label, latest)
-    if choices.phases and callable(data):
-        raise DraxError(
-            "data is a function of time, and the horizon is free: read knot.time in the functions "
-            "of the problem, or give arrays with a row for each knot."
-        )
+    if choices.phases:
+        require_rows(data)
     free: tuple[tuple[int, ...], ...] = ()
     if choices.any:
         parts = extend(choices, dynamics, given, x_init, bounds, scatter)

@@ -66,6 +66,19 @@ def _of_function(data: Callable[[Any], Any], times: np.ndarray) -> Any:
     return rows(found, times)
 
 
+def require_rows(data: Any) -> None:
+    """Where the horizon is free, data are no function of time: knots have no times yet.
+
+    Raises:
+        DraxError: they are.
+    """
+    if callable(data):
+        raise DraxError(
+            "data is a function of time, and the horizon is free: read knot.time in the functions "
+            "of the problem, or give arrays with a row for each knot."
+        )
+
+
 def later(data: Any, by: int) -> Any:
     """Arrays `by` rows later; the last row stays."""
 

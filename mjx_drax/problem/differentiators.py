@@ -65,7 +65,8 @@ class Autodiff:
 class InScalars:
     """The derivatives of another differentiator, in scalar arithmetic where that is possible.
 
-    Of the tangents of a mechanism most entries are zero, and cost nothing then; see `scalar`.
+    Of the tangents of a mechanism most entries are zero, and cost nothing then
+    (`kernels.scalars`).
     """
 
     by: Differentiator

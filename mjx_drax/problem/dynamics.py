@@ -149,8 +149,10 @@ class Dynamics:
         """An engine of its own with states (chains, nx) to step; None: f in float64."""
         return None
 
-    def configured(self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any]) -> None:
-        """Give every chain of a stepper its time between knots [s] and its parameters."""
+    def configured(
+        self, stepper: Any, dt: np.ndarray, parameters: Mapping[str, Any] | None
+    ) -> None:
+        """Give every chain of a stepper its time between knots [s] and parameters; None: as are."""
         raise NotImplementedError
 
     def times(self, states: np.ndarray, t_init: float) -> np.ndarray:

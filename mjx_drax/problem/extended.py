@@ -215,7 +215,7 @@ class Extended(Dynamics):
         def advance(k: int, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             if steps is not None or k == 0:
                 dt = np.full(len(u), float(self.dt)) if steps is None else steps[:, k]
-                self.inner.configured(stepper, dt, parameters)
+                self.inner.configured(stepper, dt, parameters if k == 0 else None)
             moved, applied = stepper(u)
             own = self.extras(x)
             v = np.concatenate([u, own.v], axis=1)[:, : own.v.shape[1]]

@@ -25,7 +25,7 @@ from mjx_drax.base.numbers import vector
 from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass, with_host_fields
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.cost import Constraint, Cost
-from mjx_drax.problem.data import later
+from mjx_drax.problem.data import later, require_rows
 from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.rollout import follow, in_double
@@ -496,6 +496,8 @@ class Problem:
         Raises:
             DraxError: they do not fit.
         """
+        if self.dynamics.phases:
+            require_rows(data)
         found = data_rows(data, self.times)
         return checked(replace(self, data=found, data_at=data if callable(data) else None))
 

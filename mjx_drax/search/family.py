@@ -290,12 +290,20 @@ class Family:
         taken = share * len(plans) + plans
         return Tracked(states[taken], controls[taken], given[taken], off[taken])
 
-    def reached(self, states: np.ndarray) -> np.ndarray:
-        """Whether motions x_0..x_K, (n, K + 1, nx), end at the goal, which the problems share."""
-        problem = self.at(0)
-        times, begin = problem.dynamics.times, float(problem.t_init)
-        ends = [float(times(motion, begin)[-1]) for motion in states]
-        return problem.all_reached(states[:, -1], ends)
+    def reached(self, of: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """Whether motions x_0..x_K, (n, K + 1, nx), of problems `of` (n,) end at their goal."""
+
+        def asked(problem: Problem, motions: np.ndarray) -> np.ndarray:
+            times, begin = problem.dynamics.times, float(problem.t_init)
+            ends = [float(times(motion, begin)[-1]) for motion in motions]
+            return problem.all_reached(motions[:, -1], ends)
+
+        if self.alone or not self.varies("dynamics", "t_init"):
+            return asked(self.at(0), states)
+        found = np.zeros(len(states), bool)
+        for i in np.unique(of):
+            found[of == i] = asked(self.at(int(i)), states[of == i])
+        return found
 
 
 def _faults(problem: Problem) -> Array:

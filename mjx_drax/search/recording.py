@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.base.errors import require_whole
+from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.descent import Info
 from mjx_drax.problem.problem import Problem
@@ -123,6 +123,8 @@ class Recording:
         """The chain's tries, the best of each attempt, up to the one that gave its answer."""
         found = [(i, *best) for i, a in enumerate(self.attempts) if (best := a.best(chain))]
         tries = [one for one in found if not self.attempts[one[0]].continues]
+        if not tries:
+            raise DraxError(f"the recording holds nothing of chain {chain}: choose another.")
         answer = min(tries, key=lambda one: one[2])[0]  # the earliest of equals
         shots = [
             (attempt, place, shot)

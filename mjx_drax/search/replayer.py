@@ -83,7 +83,7 @@ class Replayer:
             _, first, which = np.unique(keys, return_index=True, return_inverse=True)
             few = rows[first]
             plans = np.concatenate([starts[few, None], x[few]], axis=1)
-            missed[rows] = ~self.family.reached(plans)[which]
+            missed[rows] = ~self.family.reached(self.of[few], plans)[which]
         return missed
 
     def rolled_out(
@@ -134,10 +134,11 @@ class Replayer:
         plan = np.broadcast_to(x_0[:, None], (len(x_0), K + 1, dynamics.nx))
         u = controls.reshape(-1, K, dynamics.nu)
         gains = np.broadcast_to(0.0, (*u.shape, dynamics.ndx))
-        states, applied = family.replay(np.repeat(self.of[rows], samples), plan, u, gains)
+        of = np.repeat(self.of[rows], samples)
+        states, applied = family.replay(of, plan, u, gains)
         missed = np.zeros(len(u), bool)
         if family.problem.goal is not None:
-            missed = ~family.reached(states)
+            missed = ~family.reached(of, states)
         # All rows, as numbers of problems belong to rows; those not asked for stand still
         all_x, all_u = (np.repeat(np.asarray(a)[None], samples, axis=0) for a in (knots.x, knots.u))
         all_x[:, rows] = states[:, 1:].reshape(len(rows), samples, K, -1).swapaxes(0, 1)
@@ -182,9 +183,9 @@ class Replayer:
         self, rows: np.ndarray | slice, plan: np.ndarray, u: np.ndarray, gains: np.ndarray
     ) -> tuple[Tracked, np.ndarray]:
         """Replays of plans of rows, and which miss the goal; without one, which leave the plan."""
-        family = self.family
-        ran = family.tracked(self.of[rows], plan, u, gains)
-        return ran, ran.left if family.problem.goal is None else ~family.reached(ran.states)
+        family, of = self.family, self.of[rows]
+        ran = family.tracked(of, plan, u, gains)
+        return ran, ran.left if family.problem.goal is None else ~family.reached(of, ran.states)
 
     def _as_knots(
         self,

@@ -39,7 +39,7 @@ from mjx_drax.solution.replay import (
 )
 from mjx_drax.solution.report import counts, html
 from mjx_drax.solution.results import statuses, tolerance_of
-from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances
+from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances, most_broken
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
@@ -173,8 +173,7 @@ class BatchSolution:
             return None
         problem, plan, u = self.family.at(i), self.x[i].astype(float), self.u[i]
         found = plan_violations(Family.of_one(problem), plan[None], u[None]).of(0)
-        broken = [v for v in found if "equality" in v.kind]
-        return max([*broken, largest_defect(problem, plan, u)], key=lambda v: v.size)
+        return most_broken(found, largest_defect(problem, plan, u))
 
     @property
     def open_loop_is_better(self) -> np.ndarray:

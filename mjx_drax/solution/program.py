@@ -37,7 +37,7 @@ from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
 from mjx_drax.solution.report import INTERRUPTED, counts, html
 from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
-from mjx_drax.solution.violations import Violation
+from mjx_drax.solution.violations import Violation, most_broken
 
 
 def from_program(
@@ -51,7 +51,7 @@ def from_program(
     scatter: tuple[ArrayLike, ArrayLike] | None = None,
     name: str = "program",
 ) -> Problem:
-    """A nonlinear program in x (size,), as a problem that `run` and `minimize` solve.
+    """A nonlinear program in x (size,), as a problem that `minimize` solves.
 
     Args:
         size: n, number of variables.
@@ -183,7 +183,7 @@ class Minimum:
             return None
         states, u = np.zeros((1, 2, 0)), self.x[chain, None, None]
         found = plan_violations(Family.of_one(self.program), states, u).of(0)
-        return max((v for v in found if "equality" in v.kind), key=lambda v: v.size, default=None)
+        return most_broken(found)
 
     @cached_property
     def best_chain(self) -> int:

@@ -161,7 +161,7 @@ def judged(
     cost, violations = measured(family, ran, off[:, -1], extent, tolerances)
     place = KINDS.index(GOAL)
     if problem.goal is not None:
-        violations.size[:, place] = ~family.reached(states)
+        violations.size[:, place] = ~family.reached(np.arange(len(states)), states)
         violations.allowed[:, place] = 0.0
         violations.knot[:, place] = problem.horizon
         violations.allowed[:, KINDS.index(TRACKING)] = np.nan

@@ -45,6 +45,7 @@ from mjx_drax.solution.violations import (
     Tolerances,
     Violation,
     Violations,
+    most_broken,
     scatter_widths,
 )
 
@@ -259,15 +260,13 @@ class Results:
         """
         if self.feasible[chain]:
             return None
-        broken = (v for v in self.plan.of(chain) if "equality" in v.kind)
-        found = [v._replace(allowed=FEASIBLE) for v in broken]
         plan, u = self.plans[chain].astype(float), np.asarray(self.trajectories.u[chain])
         try:
-            found.append(largest_defect(self.problem, plan, u))
+            of_dynamics = largest_defect(self.problem, plan, u)
         except DraxError:  # f is not there
             defect = float(np.nan_to_num(self.max_defect[chain], nan=np.inf))
-            found.insert(0, Violation(DYNAMICS, defect, FEASIBLE, -1, -1))
-        return max(found, key=lambda v: v.ratio)
+            of_dynamics = Violation(DYNAMICS, defect, FEASIBLE, -1, -1)
+        return most_broken(self.plan.of(chain), of_dynamics)
 
     @property
     def best(self) -> Trajectory:

@@ -36,7 +36,7 @@ class Solution(Results):
         return report.html(report.lines(self), self.certified)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write `result.json` and `result.npz` into a folder, for `load`; see `results.save`.
+        """Write `result.json` and `result.npz` into a folder, for `load`; see `files.save`.
 
         Raises:
             DraxError: the folder cannot be written to.

@@ -108,6 +108,8 @@ def solve(
         settings = settled(problem, chains, seed, solver, tolerance, max_iterations, max_seconds)
         if record is not None and not isinstance(record, Recorder):
             record = Recorder(record)
+        if record is not None and record.attempts:
+            raise DraxError("record is a recorder that has recorded a solve: make another one.")
         given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess
         search = Search(
             Family.of_one(problem),

@@ -21,7 +21,7 @@ could mend it. A stage constraint is one of (x_k, u_k), k = 0..K-1, and x_0 is g
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
-from mjx_drax.search.iterate import identity_of_rows, joined
+from mjx_drax.search.iterate import FEASIBLE, identity_of_rows, joined
 from mjx_drax.solution.names import control_names, difference_names, state_names
 
 GOAL, TRACKING, DYNAMICS = "goal", "tracking", "dynamics"
@@ -262,6 +262,17 @@ class Violations:
     def data(self, motion: int) -> dict[str, dict[str, Any]]:
         """Those of one motion as files hold them, by kind."""
         return {v.kind: v.data() for v in self.of(motion)}
+
+
+def most_broken(found: Iterable[Violation], *others: Violation) -> Violation | None:
+    """What a plan that is not feasible breaks most, relative to what feasible plans may: FEASIBLE.
+
+    Args:
+        found: violations of the plan, of which those of equalities and inequalities count.
+        others: those of the dynamics, with what is allowed there.
+    """
+    broken = (v._replace(allowed=FEASIBLE) for v in found if "equality" in v.kind)
+    return max([*others, *broken], key=lambda v: v.ratio, default=None)
 
 
 def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -8,8 +8,9 @@
     peers    this solver, its ablations, IPOPT and shooting methods; an equal number of evaluations
              of f for shooting as for this solver
 
-`measure` says how each number comes about. IPOPT needs casadi (`pip install "mjx-drax[peers]"`);
-without it the suites `cpu` and `gpu` leave IPOPT out, and `peers` refuses to start.
+How each number comes about is in `measurements`. IPOPT needs casadi
+(`pip install "mjx-drax[peers]"`); without it the suites `cpu` and `gpu` leave IPOPT out, and
+`peers` refuses to start.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A curve is the share of chains (IPOPT: starts; shooting: runs) of all seeds together that held a
 certified answer at no more than twice the best known cost after so many seconds of solving;
-`measure` says how it is found out. It starts at the earliest answer and ends where the last of its
-solves ended; a method that never found one is named above the panel. Colors are Okabe and Ito's;
+how is in `measurements`. It starts at the earliest answer and ends where the last of its solves
+ended; a method that never found one is named above the panel. Colors are Okabe and Ito's;
 dashes and markers say the same without colour.
 """
 

@@ -118,7 +118,7 @@ def render_diffusion(
     below = 2 * round(_STRIP * height / 2)
     text = caption_height([*told, lines], height - below, width)
     states = finite(solution.replayed[0])
-    times = problem.times[: len(states)]
+    times = solution.times[: len(states)]
     film = Film(
         shown=shown,
         colors=Colors.of(shown[0].defects[0]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.dynamics import Dynamics
-from mjx_drax.solution.names import control_names, difference_names, state_names
+from mjx_drax.solution.names import control_names, state_names
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _UNITS = {mujoco.mjtJoint.mjJNT_SLIDE: "m", mujoco.mjtJoint.mjJNT_HINGE: "rad"}
@@ -15,11 +15,11 @@ def coordinates(dynamics: Dynamics) -> list[tuple[str, str]]:
     """Name and unit of the coordinates of positions in tangent space, (nv,).
 
     A free joint moves along x, y, z [m]; it and a ball joint turn about x, y, z [rad]. Without a
-    model they are the first half of the states, whose units are unknown, "".
+    model none are known.
     """
     model = mujoco_model(dynamics)
     if model is None:
-        return [(name, "") for name in state_names(dynamics)[: dynamics.nx // 2]]
+        return []
     found: list[tuple[str, str]] = []
     for joint, kind in _joints(model):
         if kind == _FREE:
@@ -29,16 +29,6 @@ def coordinates(dynamics: Dynamics) -> list[tuple[str, str]]:
         else:
             found += [(f"{joint} turn {axis}", "rad") for axis in "xyz"]
     return found
-
-
-def tangent_labels(dynamics: Dynamics) -> list[str]:
-    """Names of the entries of a tangent vector, (ndx,)."""
-    model = mujoco_model(dynamics)
-    if model is None:
-        return difference_names(dynamics)
-    names = [name for name, _ in coordinates(dynamics)]
-    velocities = [f"{name}, velocity" for name in names]
-    return [*names, *velocities, *(f"act[{i}]" for i in range(model.na))]
 
 
 def state_groups(dynamics: Dynamics) -> dict[str, dict[int, str]]:
@@ -57,11 +47,13 @@ def state_groups(dynamics: Dynamics) -> dict[str, dict[int, str]]:
             column += 3
         orientations |= {column + i: f"{joint} q{part}" for i, part in enumerate("wxyz")}
     velocities = [f"{name} [{unit}/s]" for name, unit in coordinates(dynamics)]
+    of_model = model.nq + model.nv + model.na
     groups = {
         "positions": positions,
         "orientations": orientations,
         "velocities": dict(enumerate(velocities, model.nq)),
         "activations": {model.nq + model.nv + i: f"act[{i}]" for i in range(model.na)},
+        "left open": dict(enumerate(state_names(dynamics)[of_model:], of_model)),
     }
     return {kind: labels for kind, labels in groups.items() if labels}
 

@@ -19,9 +19,11 @@ from mjx_drax.physics.c_engine.states import between, finite
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.extended import Extended
+from mjx_drax.solution.names import difference_names, state_names
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.geoms import Floats
-from mjx_drax.view.labels import coordinates, tangent_labels
+from mjx_drax.view.labels import coordinates
 from mjx_drax.view.plotting import (
     BLUE,
     PANELS,
@@ -57,10 +59,13 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
         )
     plan = solution.plans[solution.best_chain].astype(float)
     phases = [phases_of(dynamics, states) for states in (plan, finite(solution.replayed[0]))]
-    known = coordinates(dynamics)
+    known = [(f"{name} [{unit}]", f"velocity [{unit}/s]") for name, unit in coordinates(dynamics)]
+    if not known:  # a problem without a model
+        place, velocity = state_names(dynamics)
+        known = [(place, velocity)]
     panels = [
-        partial(_draw_phase, label=label, motions=[(q[:, i], v[:, i]) for q, v in phases])
-        for i, label in enumerate(known[:PANELS])
+        partial(_draw_phase, labels=labels, motions=[(q[:, i], v[:, i]) for q, v in phases])
+        for i, labels in enumerate(known[:PANELS])
     ]
     figure = panel_figure(panels, 3, (3.2, 2.7), legend=4)
     left = len(known) - len(panels)
@@ -71,19 +76,18 @@ def plot_phase(solution: Solution, path: str | os.PathLike[str]) -> Path:
 
 
 def _draw_phase(
-    axes: Axes, label: tuple[str, str], motions: list[tuple[np.ndarray, np.ndarray]]
+    axes: Axes, labels: tuple[str, str], motions: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    """Velocity against position of a coordinate with a name and unit: the plan, and the replay."""
+    """Velocity against position of a coordinate: the plan, and the replay."""
     plan, (position, velocity) = motions
     axes.plot(position, velocity, color=BLUE, lw=2.2, label="replay")
     axes.plot(*plan, "--", color=VERMILLION, lw=1.1, label="plan")
     for at, marker, word in ((0, "o", "start"), (-1, "s", "end")):
         style: Any = {"color": BLUE, "mec": "white", "ms": 7, "ls": "none", "zorder": 4}
         axes.plot(position[at], velocity[at], marker, label=word, **style)
-    name, unit = label
-    place = f"{name} [{unit}]" if unit else name
+    place, velocity_name = labels
     label_panel(axes, place, place, [])
-    axes.set_ylabel(f"velocity [{unit}/s]" if unit else "velocity", fontsize=8)
+    axes.set_ylabel(velocity_name, fontsize=8)
 
 
 def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
@@ -100,7 +104,7 @@ def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
         DraxError: the path cannot be written.
     """
     values = np.nan_to_num(solution.multipliers.dynamics[solution.best_chain])
-    times, names = solution.times, tangent_labels(solution.problem.dynamics)
+    times, names = solution.times, difference_names(solution.problem.dynamics)
     largest = np.abs(values).max(axis=0)
     figure = new_figure(7.0, 0.24 * len(names) + 1.7)
     axes = figure.add_subplot()
@@ -130,8 +134,9 @@ def plot_multipliers(solution: Solution, path: str | os.PathLike[str]) -> Path:
 
 
 def has_phases(dynamics: Dynamics) -> bool:
-    """Whether `plot_phase` knows which states are velocities."""
-    return mujoco_model(dynamics) is not None or dynamics.nx == 2
+    """Whether `plot_phase` can draw it: a model, or two states, of which one may be a velocity."""
+    two = dynamics.nx == 2 and not isinstance(dynamics, Extended)
+    return mujoco_model(dynamics) is not None or two
 
 
 def phases_of(dynamics: Dynamics, states: Floats) -> tuple[Floats, Floats]:

@@ -111,7 +111,8 @@ def plot_optima(solution: Solution, path: str | os.PathLike[str], draw: Draw | N
         ]
         figure = panel_figure(panels, 3, (3.0, 3.2))
     else:
-        shown, times = found[: len(CURVES)], solution.times
+        shown = found[: len(CURVES)]
+        times = [solution.times_of(optimum.chain) for optimum in shown]
         kinds = state_groups(solution.problem.dynamics).values()
         labels = sorted(pair for labels in kinds for pair in labels.items())
         panels = [
@@ -219,12 +220,12 @@ def _draw_map(axes: Axes, rank: int, optimum: Optimum, draw: Draw) -> None:
 
 
 def _draw_column(
-    axes: Axes, optima: Sequence[Optimum], column: int, label: str, times: np.ndarray
+    axes: Axes, optima: Sequence[Optimum], column: int, label: str, times: Sequence[np.ndarray]
 ) -> None:
     """One coordinate of the state over time, a curve for every optimum; the cheapest on top."""
     for i, optimum in enumerate(optima):
         axes.plot(
-            times,
+            times[i],
             optimum.replayed[0][:, column],
             color=CURVES[i],
             linestyle=DASHES[i],
@@ -232,7 +233,7 @@ def _draw_column(
             zorder=3 - i / len(optima),
             label=_name(i + 1, optimum),
         )
-    axes.set_xlim(times[0], times[-1])
+    axes.set_xlim(times[0][0], max(each[-1] for each in times))
     label_panel(axes, label, "time [s]", [])
 
 
@@ -285,7 +286,7 @@ class Curves:
 def motion_curves(solution: Solution) -> list[Curves]:
     """States, then controls, of the best chain."""
     problem, best = solution.problem, solution.best
-    plan = np.vstack([problem.x_init, best.x])
+    plan = solution.plans[solution.best_chain]
     states, controls = solution.replayed
     lower, upper = (
         np.vstack([side.x[:1], side.x]).astype(float) for side in problem.bounds.sides(best)

@@ -74,7 +74,7 @@ def render_timelapse(
     scene = Scene(model, seen_by)
     scene.begin(qpos[-1])
     opacities = np.linspace(_FIRST_OPACITY, _LAST_OPACITY, count - 1)
-    for time, opacity in zip(np.linspace(0.0, times[-1], count)[:-1], opacities, strict=True):
+    for time, opacity in zip(np.linspace(times[0], times[-1], count)[:-1], opacities, strict=True):
         scene.add_robot(interpolated(model, qpos, times, time), opacity)
     with complete(path, (".png",)) as partial:
         with open_renderer(model, 2 * height, 2 * width) as renderer:  # and halved: smooth edges

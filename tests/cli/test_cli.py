@@ -472,3 +472,34 @@ def test_check_says_what_stands_in_the_way(own, capsys):
     assert "actuator     slide: motor on joint slide, control -1 to 1" in out
     assert "CANNOT BE USED: contacts names 'foot'" in out
     assert "no.xml" in error_of(capsys, "check", "no.xml")
+
+
+def test_a_cost_file_may_define_dataclasses(own):
+    (own / "mycost.py").write_text(
+        "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+        + COST
+        + "@dataclass\nclass _Weights:\n    speed: float = 1.0\n"
+    )
+    cost_file.load(str(own / "slider.xml"), str(own / "mycost.py"), None)
+
+
+def test_what_diverges_is_null_in_json(own, capsys, monkeypatch):
+    report = {"agreement": {"velocity_error": float("nan")}, "obstacle": None}
+    monkeypatch.setattr("mjx_drax.physics.report.check", lambda *_: report)
+    assert main(["check", str(own / "slider.xml"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["agreement"] == {
+        "velocity_error": None
+    }
+
+
+def test_a_log_gets_lines_and_no_bar(slider, tmp_path, capsys, monkeypatch):
+    chosen = []
+
+    def remember(problem, *_, progress, **__):
+        chosen.append(progress)
+        raise DraxError("that is all")
+
+    monkeypatch.setattr("mjx_drax.solution.solve.solve", remember)
+    for more in ([], ["--quiet"]):
+        assert main(["solve", "pendulum", "--out", str(tmp_path), *more]) == 2
+    assert chosen == [None, False]

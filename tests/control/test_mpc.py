@@ -363,3 +363,28 @@ def test_the_command_refuses_before_it_compiles(capsys):
     assert main(["mpc", "cartpole", "--pushes", "-1"]) == 2
     assert main(["mpc", "bug_trap"]) == 2
     assert "no model to simulate" in capsys.readouterr().err
+
+
+def test_a_goal_is_asked_at_the_time_of_the_plant(slider):
+    asked = []
+
+    def late(data):
+        asked.append(data.time)
+        return data.time > 2.5
+
+    policy = MPC(replace(slider, goal=late), chains=2, explorers=0, every=10**6, solver=FAST)
+    policy.reset(slider.x_init)
+    trials = loop.Trials(policy, 3.0, False).run(1, 0, 1.0)
+    assert asked[-1] == pytest.approx(3.0)
+    numbers = trials.summary()
+    assert numbers["success_rate"] == 1.0
+    assert numbers["plans"] == 0  # no time for a further one, and nothing fails
+    assert numbers["plans_per_s"] is None
+    assert "no further plans" in "\n".join(loop.lines(numbers))
+
+
+def test_a_polish_needs_no_tail():
+    problem = balance(inequality=lambda x, u: x[:1] - 9.0)
+    MPC(problem, iterations=FAST.flow.tail + 1, solver=FAST)
+    with pytest.raises(DraxError, match="iterations is 31, but the solver's tail has 30"):
+        MPC(balance(), iterations=FAST.flow.tail + 1, solver=FAST)

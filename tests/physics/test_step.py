@@ -16,7 +16,7 @@ from mjx_drax import Autodiff, Smoothed, from_mjcf, tasks
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.method.model import linearize
 from mjx_drax.physics.agreement.checks import Samples, compare
-from mjx_drax.physics.c_engine.states import Engine, difference, moved
+from mjx_drax.physics.c_engine.states import Engine, difference, moved, quiet, without
 from mjx_drax.physics.c_engine.stepper import Spare, Stepper, cores
 from mjx_drax.problem.trajectory import Trajectory
 
@@ -390,3 +390,27 @@ def test_a_stepper_learns_how_long_a_knot_takes():
     with Stepper(model, 3, np.zeros((5, model.nq + model.nv + model.na)), spare) as stepper:
         stepper(np.zeros((5, model.nu)))
     assert spare.seconds <= first
+
+
+def test_mujocos_warnings_return_when_the_last_of_several_threads_is_done():
+    before, first, second = mujoco.get_mju_user_warning(), quiet(), quiet()
+    first.__enter__()
+    second.__enter__()
+    assert mujoco.get_mju_user_warning() is not before
+    first.__exit__(None, None, None)  # the one that came first goes first
+    assert mujoco.get_mju_user_warning() is not before
+    second.__exit__(None, None, None)
+    assert mujoco.get_mju_user_warning() is before
+
+
+def test_a_users_filter_of_contacts_comes_back():
+    def own(model, data, a, b):
+        return False
+
+    mujoco.set_mjcb_contactfilter(own)
+    try:
+        with without({(0, 1)}):
+            assert mujoco.get_mjcb_contactfilter() is not own
+        assert mujoco.get_mjcb_contactfilter() is own
+    finally:
+        mujoco.set_mjcb_contactfilter(None)

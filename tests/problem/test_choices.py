@@ -12,6 +12,7 @@ from builders import DT, K, arm, double_integrator, matrices, robot
 from mjx_drax import (
     Constant,
     DraxError,
+    Dynamics,
     Identity,
     Langevin,
     Solution,
@@ -216,6 +217,26 @@ def test_the_c_engine_replays_the_changed_model_at_its_own_step():
     start = problem.start_from(jnp.asarray(plan[0, 0], problem.x_init.dtype))
     knots = Trajectory(jnp.asarray(states[0, 1:]), jnp.asarray(u[0]), start=start)
     assert np.abs(problem.defects(knots)).max() < 1e-5  # f is that of the changed model, too
+
+
+def test_a_replay_computes_the_numbers_of_a_model_once():
+    seen = []
+
+    def numbers(model, p):
+        seen.append(p)
+        return {"body_mass": model.body_mass.at[1].set(p["mass"])}
+
+    problem = robot(
+        horizon=(0.05, 0.2),
+        knots=5,
+        dt=0.01,
+        parameters={"mass": (0.5, 3.0)},
+        model_numbers=numbers,
+    )
+    plan = np.tile(np.asarray(problem.x_init, float), (2, 6, 1))
+    seen.clear()
+    problem.replay(plan, np.zeros((2, 5, 1)), np.zeros((2, 5, 1, 4)))
+    assert len(seen) == 1
 
 
 @pytest.mark.slow
@@ -466,3 +487,31 @@ def test_draws_agree_with_what_is_chosen():
     assert np.ptp(extras.p) == np.ptp(extras.h) == 0.0
     assert 1.0 < extras.p[0, 0] < 2.0
     np.testing.assert_array_equal(extras.v[1:, 0], knots.u[:, 0])
+
+
+def test_a_class_that_takes_no_step_of_a_free_duration_is_refused():
+    class Fixed(Dynamics):
+        dt, nx, nu = DT, 2, 1
+
+        def step(self, x, u):
+            return x + self.dt * jnp.stack([x[1], u[0]])
+
+    given = {"x_init": [0.0, 0.0], "nu": 1, "running_cost": lambda x, u: u @ u}
+    with pytest.raises(DraxError, match=r"horizon is free, and Fixed .* at\(knot\)"):
+        from_function(Fixed(), horizon=(1.0, 6.0), knots=30, **given)
+    with pytest.raises(DraxError, match=r"0\.5 s apart .* step of Fixed is"):
+        from_function(Fixed(), horizon=3.0, dt=0.5, **given)
+
+
+def test_data_of_a_free_duration_stay_rows():
+    problem = from_function(
+        lambda x, u, knot: x + knot.dt * u + 0.0 * knot.data,
+        x_init=[0.0],
+        nu=1,
+        horizon=(0.5, 1.0),
+        knots=4,
+        data=np.zeros((5, 1)),
+        running_cost=lambda x, u: u @ u,
+    )
+    with pytest.raises(DraxError, match="data is a function of time, and the horizon is free"):
+        problem.with_data(lambda t: jnp.stack([t]))

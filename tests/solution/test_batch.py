@@ -10,6 +10,7 @@ from jax.tree_util import Partial
 from mjx_drax import DraxError, Langevin, Polish, Restarts, from_function, from_mjcf, solve_batch
 from mjx_drax.search import engine
 from mjx_drax.search.engine import Search
+from mjx_drax.search.family import Family
 
 DT = 0.1
 SOLVER = Restarts(replace(Restarts().flow, iterations=30, tail=20), descent=20, attempts=3)
@@ -266,3 +267,19 @@ def test_what_misfits_is_refused(values, rest, message):
 
     with pytest.raises(DraxError, match=message):
         solve_batch(make, values, **rest)
+
+
+def test_goals_are_asked_at_the_times_of_their_own_problems():
+    with_goal = replace(BASE, goal=lambda x: True)
+    family = Family.of(lambda t: replace(with_goal, t_init=t), jnp.asarray([0.0, 1.0, 2.0]))
+    asked = []
+
+    def remember(self, x, times):
+        asked.extend(times)
+        return np.ones(len(x), bool)
+
+    of = np.array([2, 0, 1, 2])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(BASE), "all_reached", remember)
+        family.reached(of, np.zeros((4, 11, 2)))
+    assert sorted(asked) == pytest.approx([1.0, 2.0, 3.0, 3.0])

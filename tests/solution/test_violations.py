@@ -23,10 +23,11 @@ from mjx_drax import (
 )
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.program import from_program
 from mjx_drax.solution.replay import open_loop_is_better, replays
 from mjx_drax.solution.report import lines
-from mjx_drax.solution.violations import KINDS, warn_of_loose_ends
+from mjx_drax.solution.violations import KINDS, Violation, most_broken, warn_of_loose_ends
 from mjx_drax.view import plotting
 from mjx_drax.view.video import outcome_lines
 
@@ -402,3 +403,13 @@ def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, 
         warn_of_loose_ends(*given)
     told = [f"off the terminal equality by {place:.1e}" in str(w.message) for w in found]
     assert told == [True] * warned
+
+
+def test_the_worst_of_a_plan_is_relative_to_what_plans_may_break():
+    of_dynamics = Violation("dynamics", 0.6, 0.2, 0, 3)  # three times what is allowed
+    broken = Violation("inequality", 0.5, 0.4, 1, 2)  # less, and 500 times what a plan may
+    bounds = Violation("state_bounds", 9.0, 1.0, 0, 0)
+    worst = most_broken([bounds, broken], of_dynamics)
+    assert worst == broken._replace(allowed=FEASIBLE)
+    assert most_broken([bounds], of_dynamics) is of_dynamics
+    assert most_broken([]) is None

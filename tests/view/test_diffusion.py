@@ -9,12 +9,15 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+from jax import Array
 from matplotlib.axes import Axes
 from PIL import Image
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Constant
+from mjx_drax.problem.build import from_function
+from mjx_drax.problem.trajectory import Knot
 from mjx_drax.search import recording
 from mjx_drax.search.recording import Recorder, Recording, Snapshot, Tries
 from mjx_drax.solution.solution import Solution
@@ -91,6 +94,53 @@ def test_what_cannot_be_recorded() -> None:
     for every in (0, 1.5, -1):
         with pytest.raises(DraxError, match="record is"):
             Recorder(every)  # type: ignore[arg-type]
+
+
+def test_a_recorder_records_one_solve() -> None:
+    used = Recorder(1)
+    used.begin()
+    with pytest.raises(DraxError, match="make another one"):
+        solve(load("pendulum").make(), chains=1, record=used)
+
+
+def test_a_chain_of_which_nothing_was_recorded() -> None:
+    tries = Tries([_snapshot(0, [0.0, 1.0], [0.0, 0.0])], owners=np.array([0, -1]))
+    with pytest.raises(DraxError, match="nothing of chain 1"):
+        Recording([tries]).history_of(1)
+
+
+def test_the_film_of_a_free_duration_shows_the_time_of_its_motion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drift(x: Array, u: Array, knot: Knot) -> Array:
+        return x + knot.dt * u
+
+    problem = from_function(
+        drift,
+        x_init=[0.0],
+        nu=1,
+        horizon=(0.5, 4.0),
+        knots=5,
+        running_cost=lambda x, u: u @ u,
+    )
+    solution = solve(problem, chains=1, solver=SHORT, record=2)
+    seen = []
+
+    def remember(times: np.ndarray, *_: object) -> np.ndarray:
+        seen.append(times)
+        return times
+
+    monkeypatch.setattr(diffusion, "frame_times", remember)
+    render_diffusion(
+        solution,
+        tmp_path / "film.webp",
+        seconds=0.2,
+        fps=5,
+        size=(160, 120),
+        draw=lambda axes, x: axes.plot(x[:, 0], x[:, 1]),
+    )
+    np.testing.assert_array_equal(seen[0], solution.times)
+    assert abs(solution.times[-1] - problem.times[-1]) > 1e-3
 
 
 @pytest.mark.parametrize("painted", [False, True])

@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from builders import made_up, robot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
@@ -168,9 +169,32 @@ def test_quaternions_have_a_panel_of_their_own(quadrotor: Dynamics) -> None:
     assert groups["velocities"][12] == "root turn z [rad/s]"
 
 
+def test_what_a_problem_leaves_open_is_named_and_drawn_at_the_motions_own_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = robot(horizon=(0.2, 0.8), knots=4, dt=0.1, parameters={"load": (0.5, 3.0)})
+    names = ["qpos_elbow", "qvel_elbow", "load", "step"]
+    made = made_up(problem)
+    made.trajectories.x[:, :, 2:] = [0.7, 0.05]
+    first = problem.start_from(np.float32([0.0, 0.0, 0.7, 0.05]))
+    start = np.tile(np.asarray(first), (2, 1))
+    found = replace(made, trajectories=replace(made.trajectories, start=start))
+    groups = labels.state_groups(problem.dynamics)
+    assert list(groups["left open"].values()) == ["load", "step"]
+    seen = {}
+    monkeypatch.setattr(
+        Axes, "set_yticks", lambda self, at, ticks=(), **_: seen.update(ticks=ticks)
+    )
+    phase_plots.plot_multipliers(found, tmp_path / "multipliers.png")
+    assert list(seen["ticks"]) == names
+    np.testing.assert_allclose(found.times, np.arange(5) * 0.05, rtol=1e-6)
+    step = plotting.motion_curves(found)[-2]
+    assert "step" in step.labels
+    np.testing.assert_allclose(step.plan[:, step.labels.index("step")], 0.05, rtol=1e-6)
+
+
 def test_phase_plots_of_turns_are_in_tangent_space(quadrotor: Dynamics) -> None:
     assert labels.coordinates(quadrotor)[2:4] == [("root z", "m"), ("root turn x", "rad")]
-    assert len(labels.tangent_labels(quadrotor)) == 12
     angle = np.linspace(0.0, 3.0, 5)
     states = np.zeros((5, 13))
     states[:, 0], states[:, 12] = 2.0, 1.5

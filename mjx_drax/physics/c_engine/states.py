@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import threading
 from collections.abc import Collection, Iterator
 from typing import Any
 
@@ -20,20 +21,37 @@ from mjx_drax.physics.joints import Joints
 
 Floats = npt.NDArray[np.floating]
 
+_FILTER = threading.RLock()
+
 STOPPED = 10.0
 """Damping times timestep, in inertias, above which a velocity is no state that a model comes to. A
 base that is held by a damping of 1e11 would be pushed with as many newtons."""
 
 
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Keep MuJoCo from printing warnings, and from writing MUJOCO_LOG.TXT into the folder."""
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
+class _Quiet:
+    """What keeps MuJoCo quiet; MuJoCo has one handler for all threads."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._handler = threading.Lock(), 0, None
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Keep MuJoCo from printing warnings, and from writing MUJOCO_LOG.TXT into the folder."""
+        with self._lock:
+            if not self._inside:
+                self._handler = mujoco.get_mju_user_warning()
+                mujoco.set_mju_user_warning(lambda message: None)
+            self._inside += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside:
+                    mujoco.set_mju_user_warning(self._handler)
+
+
+quiet = _Quiet()
 
 
 def finite(states: Floats) -> Floats:
@@ -124,15 +142,21 @@ def interpolated(model: mujoco.MjModel, qpos: Floats, times: Floats, time: float
 
 @contextlib.contextmanager
 def without(pairs: Collection[Pair]) -> Iterator[None]:
-    """Keep the C engine from making contacts between pairs of geoms; of a <pair> it makes them."""
-    if pairs:
-        both = {*pairs, *((b, a) for a, b in pairs)}
-        mujoco.set_mjcb_contactfilter(lambda model, data, a, b: (a, b) in both)
-    try:
+    """Keep the C engine from making contacts between pairs of geoms; of a <pair> it makes them.
+
+    MuJoCo has one filter for all threads, so one thread at a time does this.
+    """
+    if not pairs:
         yield
-    finally:
-        if pairs:
-            mujoco.set_mjcb_contactfilter(None)
+        return
+    both = {*pairs, *((b, a) for a, b in pairs)}
+    with _FILTER:
+        before = mujoco.get_mjcb_contactfilter()
+        mujoco.set_mjcb_contactfilter(lambda model, data, a, b: (a, b) in both)
+        try:
+            yield
+        finally:
+            mujoco.set_mjcb_contactfilter(before)
 
 
 CONVERGED = {"iterations": 200, "ls_iterations": 100, "tolerance": 1e-12, "ls_tolerance": 0.01}

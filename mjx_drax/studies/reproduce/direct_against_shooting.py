@@ -7,7 +7,7 @@ and the step of a Gauss-Newton model about the rollout,
 
     u_k <- u_k + beta k_k + K_k (x_k - x_k^old),    x_{k+1} = f(x_k, u_k),
 
-with the largest beta of 1, 1/2, 1/4, ... that lowers the cost (iLQR, with a barrier for the bounds
+with the beta of 1, 1/2, 1/4, ... that has the least cost (iLQR, with a barrier for the bounds
 whose weight falls). Which states can be upright at all is found by dynamic programming, or by one
 of the two.
 """

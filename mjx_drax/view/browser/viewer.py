@@ -97,9 +97,9 @@ def _play(server: viser.ViserServer, solution: Solution, until: threading.Event)
     scene = ReplayScene(server, solution, POSES)
     *lines, _ = outcome_lines(solution)  # without the time
     server.gui.add_markdown("  \n".join(lines))
-    times, end = scene.times, float(scene.times[-1])
-    step = max(end / 1000.0, 1e-6)
-    bar: Any = server.gui.add_slider("time [s]", 0.0, max(end, step), step, 0.0)
+    times, begin, end = scene.times, float(scene.times[0]), float(scene.times[-1])
+    step = max((end - begin) / 1000.0, 1e-6)
+    bar: Any = server.gui.add_slider("time [s]", begin, max(end, begin + step), step, begin)
     playing = server.gui.add_checkbox("play", True)
     speed = server.gui.add_slider("speed", 0.05, 2.0, 0.05, 1.0)
 
@@ -116,7 +116,7 @@ def _play(server: viser.ViserServer, solution: Solution, until: threading.Event)
     while not until.wait(_FRAME):
         if playing.value:
             now = bar.value + _FRAME * speed.value
-            bar.value = now if now <= end else 0.0
+            bar.value = now if now <= end else begin
         knot = knot_at(times, bar.value)
         if knot != shown:
             with server.atomic():
@@ -225,7 +225,7 @@ def show_natively(solution: Solution, until: threading.Event | None = None) -> N
     times = solution.times_of(solution.best_chain)
     size, data, planned = model.nq + model.nv + model.na, mujoco.MjData(model), mujoco.MjData(model)
     keys: list[int] = []
-    playing, now = True, 0.0
+    playing, now = True, float(times[0])
     with native.launch_passive(model, data, key_callback=keys.append) as window:
         window.opt.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = 1
         while window.is_running() and not (until is not None and until.is_set()):
@@ -249,4 +249,4 @@ def show_natively(solution: Solution, until: threading.Event | None = None) -> N
             window.sync()
             time.sleep(_FRAME)
             if playing:
-                now = now + _FRAME if now < times[len(states) - 1] else 0.0
+                now = now + _FRAME if now < times[len(states) - 1] else float(times[0])
