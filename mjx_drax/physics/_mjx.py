@@ -18,9 +18,6 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     # constraint forces
     from mujoco.mjx._src import collision_driver as collision_driver
     from mujoco.mjx._src import mesh as meshes  # noqa: F401
-    from mujoco.mjx._src.collision_convex import (
-        _create_contact_manifold as contact_manifold,  # noqa: F401
-    )
     from mujoco.mjx._src.collision_convex import _manifold_points as four_of  # noqa: F401
     from mujoco.mjx._src.collision_driver import (
         _COLLISION_FUNC as COLLISIONS,  # noqa: F401

@@ -257,7 +257,7 @@ def _scatter(
     if dynamics.kinked and u is None:  # about the controls that hold x_init
         ends = np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)
         width = np.where(np.isfinite(ends[1] - ends[0]), (ends[1] - ends[0]) / 2, 1.0)
-        held, rest = np.stack([x_init, x_init]), middle_control(bounds)
+        held, rest = np.stack([x_init, x_init]), np.atleast_2d(middle_control(bounds))[:1]
         hold = np.clip(inverse_dynamics(model, held, dynamics.dt, rest)[0], *ends)
         u = hold - width, hold + width
     positions = np.ones(model.nq)

@@ -63,12 +63,15 @@ def look_again(problem: Problem) -> None:
         _forget()
     try:
         now = _of_functions(leaves, tree)
-    except Exception:  # as in `identity`
+    except Exception:  # as in `identity`; whether they have changed cannot be told
+        _forget()
         return
     if before == now:
         not_read(tree, changed)
     elif before is not None:
         _forget()
+    else:  # f may be known from another problem, by itself
+        untraced.cache_clear()
     _found[kind] = now
     if len(_found) > REMEMBERED:
         del _found[next(iter(_found))]

@@ -170,6 +170,17 @@ def test_given_bounds_are_added_to_the_ranges():
     np.testing.assert_allclose(bounds.u_upper, [3.0, 5.0])
 
 
+@pytest.mark.parametrize("contact", [False, True])
+def test_controls_are_drawn_within_bounds_of_their_own_at_each_knot(contact):
+    late = np.array([0.0, 0.0, 1.0, 2.0, 2.0])[:, None] * np.ones(2)
+    made = problem(arm(world=FLOOR, contact=contact), horizon=0.1, u_bounds=(-late, late))
+    assert made.dynamics.kinked is contact
+    for seed in range(3):
+        u = np.asarray(made.draw(jax.random.key(seed)).u)
+        np.testing.assert_allclose(u[:2], 0.0, atol=1e-6)
+        assert np.abs(u[2:]).max() > 0.1
+
+
 def test_no_velocities_are_drawn_where_damping_ends_them_within_a_step():
     """As where a robot's base is held by an enormous damping, and not by a weld."""
     held = """

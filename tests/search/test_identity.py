@@ -227,6 +227,31 @@ def test_another_motion_has_what_functions_read_by_then(many, target):
         assert np.allclose(ends[:, 0], target[0], atol=0.02)
 
 
+@pytest.mark.parametrize("told", [True, False], ids=["told", "cannot be told"])
+def test_another_problem_is_replayed_with_what_f_reads_by_then(told):
+    mass = [1.0]
+
+    def cart(x, u):
+        return x + 0.1 * jnp.stack([x[1], u[0] / mass[0]])
+
+    @jax.custom_vjp
+    def square(x):
+        return x**2
+
+    square.defvjp(lambda x: (x**2, x), lambda x, g: (2 * x * g,))
+
+    def effort(x, u):
+        return u @ u if told else square(u[0])
+
+    plan, u = np.zeros((1, 4, 2)), np.ones((1, 3, 2))
+    for mass[0] in (1.0, 2.0):
+        running = (lambda x, u: u @ u) if told else effort  # another one each time, or the same
+        problem = posed(f=cart, running_cost=running, horizon=0.3)
+        look_again(problem)
+        states, _ = problem.replay(plan, u, np.zeros((1, 3, 2, 2)))
+        assert states[0, -1, 1] == pytest.approx(0.3 / mass[0])
+
+
 def test_rules_of_batches_count():
     def ruled(factor):
         @jax.custom_batching.custom_vmap

@@ -65,9 +65,6 @@ STEEP, UPRIGHT = 0.1, 1e-6
 """Cosines of a capsule's angle with a plane: below the first its directions of friction count as
 constant in derivatives, which grow without bound; below the second they are the plane's."""
 
-SAME = 1e-6
-"""How close two contacts of one pair are the same one [m]."""
-
 TURNS = 4
 """How often three corners of a face move on in turn; with sixteen corners they stop after three."""
 
@@ -523,22 +520,6 @@ def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Co
     return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
 
-def _distinct(collide: Any) -> Any:
-    """MJX's function of two polytopes, with no contact twice.
-
-    Where fewer than four corners overlap MJX repeats some of them, and contacts push as often.
-    """
-
-    def function(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
-        dist, pos, frame = collide(model, data, key, geom)
-        four = pos.reshape(-1, 4, 3)
-        same = jnp.max(jnp.abs(four[:, :, None] - four[:, None]), axis=-1) < SAME
-        again = jnp.any(jnp.tril(same, -1) & (dist.reshape(-1, 1, 4) < curved.APART), axis=2)
-        return jnp.where(again.reshape(-1), curved.APART, dist), pos, frame
-
-    return _function(function, 4)
-
-
 def _of_spheres(
     collide: Callable[[mjx.Model, mjx.Data, Array], Contacts], contacts: int = 1
 ) -> Any:
@@ -565,6 +546,7 @@ def _function(collide: Any, contacts: int) -> Any:
 _HULLS = {(BOX, BOX), (BOX, MESH), (MESH, MESH)}
 """Kinds of geoms that `between_hulls` collides."""
 
+_BETWEEN_HULLS = _function(between_hulls, 4)
 _CYLINDERS, _ELLIPSOIDS = _function(with_corners, 4), _function(with_corners, 1)
 
 _OWN = {
@@ -582,8 +564,8 @@ _OWN = {
     (ELLIPSOID, MESH): _ELLIPSOIDS,
     (CYLINDER, BOX): _CYLINDERS,
     (CYLINDER, MESH): _CYLINDERS,
-    (BOX, BOX): _distinct(between_hulls),
-    (BOX, MESH): _distinct(between_hulls),
-    (MESH, MESH): _distinct(between_hulls),
+    (BOX, BOX): _BETWEEN_HULLS,
+    (BOX, MESH): _BETWEEN_HULLS,
+    (MESH, MESH): _BETWEEN_HULLS,
 }
 """Kinds of geoms, the lower one first, and what collides them in place of MJX."""

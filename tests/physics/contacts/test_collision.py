@@ -1,5 +1,7 @@
 """Contacts, against those of MuJoCo's C engine."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -130,6 +132,18 @@ def approached(model, count, depth, seed=0):
         yield data
 
 
+def laid(model, count):
+    """Data of the C engine with one geom nearly flat on the other."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(count):
+        data.qpos[3:] = 1.0, *(0.02 * rng.normal(size=2)), rng.uniform(-1, 1)
+        data.qpos[:3] = *rng.uniform(-0.05, 0.05, 2), 0.5
+        mujoco.mj_kinematics(model, data)
+        data.qpos[2] -= mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None) + 0.002
+        mujoco.mj_forward(model, data)
+        yield data
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "other", "usual", "worst"),
@@ -181,6 +195,45 @@ def test_the_side_of_a_cylinder_touches_an_edge_once_as_in_the_c_engine():
             assert wanted.ncon == 1
             assert np.sum(found.dist < 0) == 1
             np.testing.assert_allclose(found.dist.min(), wanted.contact.dist[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["box", 'mesh" mesh="m'], ids=["box", "mesh"])
+def test_meshes_touch_boxes_and_meshes_as_in_the_c_engine(kind):
+    """In any pose, and nearly flat on each other: as many contacts, where it has them."""
+    model, counts = meeting(kind, MESHES), []
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for wanted in itertools.chain(approached(model, 60, 0.004), laid(model, 40)):
+            found, there = find(wanted), wanted.contact
+            acts = np.asarray(found.dist) < 0
+            assert acts.sum() == wanted.ncon > 0
+            sign = 1 if there.geom[0, 0] == found.geom[0, 0] else -1
+            here = np.c_[found.dist, found.pos, sign * np.asarray(found.frame)[:, 0]][acts]
+            apart = np.abs(here[:, None] - np.c_[there.dist, there.pos, there.frame[:, :3]])
+            counts.append((wanted.ncon, max(apart.max(axis=2).min(axis=i).max() for i in (0, 1))))
+    ncon, errors = np.array(counts).T
+    assert set(ncon) >= {1, 2, 3, 4}
+    assert np.quantile(errors, 0.9) < 1e-4
+
+
+def test_a_box_lies_on_a_box_however_its_sides_lie_as_in_the_c_engine():
+    """Edges of boxes that overlap a little less than the faces do not touch in their place."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="box" size=".1 .1 .05"/>
+        <body><freejoint/><geom type="box" size=".1 .1 .04"/></body></worldbody></mujoco>"""
+    )
+    at, rng = mujoco.MjData(model), np.random.default_rng(0)
+    with jax.enable_x64(True):
+        find = contacts_of(model)
+        for tilt in [0.0] + [0.002] * 10 + [0.03] * 10:
+            at.qpos[:] = [0.01, 0.02, 0.0885, 1, *rng.normal(size=2) * tilt, 0]
+            mujoco.mj_forward(model, at)
+            found = find(at)
+            acts = np.asarray(found.dist) < 0
+            assert acts.sum() == at.ncon
+            np.testing.assert_allclose(
+                np.sort(np.asarray(found.dist)[acts]), np.sort(at.contact.dist), atol=1e-6
+            )
 
 
 def test_two_boxes_touch_at_every_point_once():
