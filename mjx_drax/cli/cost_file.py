@@ -36,6 +36,8 @@ function may have one more parameter, `knot` (time, index, dt, data, parameters)
   guess(key) -> Trajectory initial knots of one chain
   contacts                 how many contact points the plan keeps, the nearest ones; False: none;
                            or the pairs that may touch, [("foot_*", "floor"), ...]
+  stops                    joints that may lean on their limits: True, or ["knee_*"]; the ranges
+                           of other driven joints are bounds
   actuators                for a model without: "torque", {"torque": limit} or {"position": kp}
   derivatives              of the dynamics: mjx_drax.Smoothed(); default exact
   solver                   a mjx_drax.Restarts or mjx_drax.Langevin

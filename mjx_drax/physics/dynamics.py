@@ -266,6 +266,12 @@ class MjxDynamics(Dynamics):
         return KINKED_STATE_DAMPING if self.kinked else 1.0
 
     @property
+    def stops(self) -> list[int]:
+        """The joints whose limits act in the dynamics of the plan."""
+        found: list[int] = np.flatnonzero(self.model.jnt_limited).tolist()
+        return found
+
+    @property
     def contacts(self) -> Contacts:
         """Whether the plan has contacts, or how many of each friction dimension it keeps.
 

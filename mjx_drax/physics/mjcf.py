@@ -21,7 +21,7 @@ from mjx_drax.physics.contacts.pairs import Contacts
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, Joints
-from mjx_drax.physics.mjx_model import free_ranges, kept_contacts, put_model
+from mjx_drax.physics.mjx_model import Stops, free_ranges, kept_contacts, put_model
 from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.near import affordable
 from mjx_drax.physics.source import load, model_name, origin_of
@@ -54,6 +54,7 @@ def from_mjcf(
     x_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     u_scatter: tuple[ArrayLike, ArrayLike] | None = None,
     contacts: Contacts = True,
+    stops: Stops = False,
     actuators: Actuators | None = None,
     derivatives: Differentiator | None = None,
     x_init_bounds: tuple[ArrayLike, ArrayLike] | None = None,
@@ -109,6 +110,9 @@ def from_mjcf(
             so). False plans as if nothing could touch, which is right where constraints keep bodies
             apart. Or the pairs that may touch, [("foot_*", "floor"), ...]: names of geoms or
             bodies, * stands for any characters. The C engine that certifies keeps all contacts.
+        stops: which driven joints may lean on the ends of their ranges: True, or patterns of names,
+            ["knee_*"]. Their limits act in the dynamics as contacts do; the ranges of the others
+            are bounds on the knots.
         actuators: for a model that has none, one for each hinge and slide. "torque": motors with
             the limits that joints give by actuatorfrcrange; {"torque": limit} also where they give
             none [N m, N]. {"position": kp}: servos with this gain, critically damped. Numbers
@@ -165,7 +169,7 @@ def from_mjcf(
             "horizon=(least, most); else give dt."
         )
     K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
-    x0, bounded = checked_start(mj_model, name, x_init)
+    x0, bounded = checked_start(mj_model, name, x_init, stops)
     contacts = affordable(mj_model, name, x0, bounded, contacts)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)

@@ -9,17 +9,22 @@ knows those that a model has, and `checks` measures whether they matter.
 from __future__ import annotations
 
 import copy
+import fnmatch
+from collections.abc import Sequence
 
 import jax
 import numpy as np
 
-from mjx_drax.base.errors import DraxError
+from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.physics._mjx import COLLISIONS, geom_pairs, internal, mjx
 from mjx_drax.physics.actuators import disabled, driven
 from mjx_drax.physics.contacts.collision import extended, make_data, signature
 from mjx_drax.physics.contacts.pairs import Contacts, Pair, geom_name, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
+
+Stops = bool | Sequence[str]
+"""Which driven joints may lean on their limits: all, none, or patterns of names."""
 
 _DISABLE, _ENABLE, _GEOM = mujoco.mjtDisableBit, mujoco.mjtEnableBit, mujoco.mjtGeom
 _SENSORS = {int(kind) for kind in mjx.SensorType}
@@ -288,16 +293,46 @@ def free_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return model.jnt_range[:, 0] + model.jnt_margin, model.jnt_range[:, 1] - model.jnt_margin
 
 
-def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray) -> np.ndarray:
+def bounded_joints(model: mujoco.MjModel, x_init: np.ndarray, stops: Stops = False) -> np.ndarray:
     """Joints whose range becomes a bound on knots, (njnt,).
 
-    Those are hinges and slides that an actuator drives and that start inside of their range. Where
-    a joint rests on its limit, or starts beyond it, the limit's force must stay in the dynamics.
+    Those are hinges and slides that an actuator drives and that start inside of their range, but
+    for `stops`. Where a joint rests on its limit, or starts beyond it, the limit's force must stay
+    in the dynamics.
+
+    Raises:
+        DraxError: stops has another form, or a pattern fits no joint with a range.
     """
     single = np.isin(model.jnt_type, (SLIDE, HINGE)) & (model.jnt_limited != 0)
     start = x_init[model.jnt_qposadr]
     lower, upper = free_ranges(model)
-    return has_limits(model) & single & driven(model) & (start > lower) & (start < upper)
+    inside = (start > lower) & (start < upper)
+    return has_limits(model) & single & driven(model) & inside & ~_stopping(model, stops)
+
+
+def _stopping(model: mujoco.MjModel, stops: Stops) -> np.ndarray:
+    """Joints that may lean on their limits, (njnt,)."""
+    if isinstance(stops, bool):
+        return np.full(model.njnt, stops)
+    if isinstance(stops, str) or not all(isinstance(pattern, str) for pattern in stops):
+        raise DraxError(
+            f"stops is {shown(stops)}: give True, False or patterns of names of joints, such as "
+            '["knee_*"].'
+        )
+    limited = [model.joint(j).name for j in np.flatnonzero(model.jnt_limited)]
+    for pattern in stops:
+        if not fnmatch.filter(limited, pattern):
+            raise DraxError(
+                f"stops names {pattern!r}, which no joint with a range is called: those are "
+                f"{', '.join(map(repr, limited)) or 'none'}."
+            )
+    return np.array(
+        [
+            any(fnmatch.fnmatchcase(model.joint(j).name, pattern) for pattern in stops)
+            for j in range(model.njnt)
+        ],
+        bool,
+    )
 
 
 def has_limits(model: mujoco.MjModel) -> bool:

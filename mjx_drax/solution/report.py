@@ -8,6 +8,7 @@ from html import escape
 
 import numpy as np
 
+from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
@@ -215,14 +216,18 @@ def _advice(solution: Results) -> str:
     broken = {v.kind for v in violations if v.broken}
     costs = solution.cost[solution.feasible]
     alike = int(np.isclose(costs, np.median(costs), rtol=ALIKE).sum())
+    model = mjx_dynamics(solution.problem.dynamics)
+    stops = ""
+    if model is not None and model.kinked and len(model.stops) < model.mj_model.jnt_limited.sum():
+        stops = " With stops=True, joints may lean on their stops."
     if broken <= {GOAL} and len(costs) > 2 and alike > len(costs) / 2:
         return (
             f"feasible chains miss the goal, {alike} of {len(costs)} at the same cost, so more "
             "chains will hardly help. Give a longer horizon, a guess of another motion, or more "
-            "weight on the terminal cost."
+            f"weight on the terminal cost.{stops}"
         )
     return (
         "feasible chains miss the goal or break constraints when replayed. Try a guess of the "
         "motion, more chains, a higher weight on the terminal cost, or a longer horizon; "
-        "tolerances say what counts as broken."
+        f"tolerances say what counts as broken.{stops}"
     )

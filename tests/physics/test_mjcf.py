@@ -162,6 +162,25 @@ def test_ranges_become_bounds():
     np.testing.assert_allclose(bounds.u_upper, [3.0, inf])
 
 
+def test_a_joint_may_lean_on_its_stop():
+    """As MuJoCo has it; without `stops` it is a bound that no plan comes to."""
+    kept, leaning = problem(arm()), problem(arm(), stops=["*"])
+    assert kept.bounds.x_upper[0] == pytest.approx(0.25)
+    assert not np.isfinite(leaning.bounds.x_upper).any()
+    assert leaning.dynamics.stops
+    x, u = np.zeros((1, 9, 5)), np.tile([-2.0, 0.0], (1, 8, 1))
+    x[:, :, 0] = -0.49
+    states, _ = leaning.replay(x, u, np.zeros((1, 8, 2, leaning.dynamics.ndx)))
+    assert -0.52 < states[0, -1, 0] < -0.5
+    for k in range(8):  # f is the engine's, also where it leans
+        after = leaning.dynamics.step(jnp.asarray(states[0, k]), jnp.asarray(u[0, k]))
+        np.testing.assert_allclose(after, states[0, k + 1], atol=2e-3)
+    with pytest.raises(DraxError, match="stops names 'knee', which no joint with a range"):
+        problem(arm(), stops=["knee"])
+    with pytest.raises(DraxError, match="stops is 'elbow'"):
+        problem(arm(), stops="elbow")
+
+
 def test_given_bounds_are_added_to_the_ranges():
     bounds = problem(arm(), x_bounds=(-0.1, 1.0), u_bounds=([-1.0, -5.0], [9.0, 5.0])).bounds
     np.testing.assert_allclose(bounds.x_lower, [-0.1] * 5)

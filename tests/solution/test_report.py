@@ -9,6 +9,8 @@ from builders import BALL, arm, made_up, point, robot
 
 from mjx_drax import DraxError, Restarts, Solution, from_program, minimize, solve_batch
 from mjx_drax.solution.names import difference_names
+from mjx_drax.solution.report import lines
+from mjx_drax.solution.violations import GOAL, KINDS
 
 ONCE = Restarts(descent=5, attempts=1)
 
@@ -159,3 +161,21 @@ def test_one_motion_of_one_chain_or_of_several():
     dear = replace(made.open_loop, cost=np.array([1.0, 1.2], np.float32))
     unlike = replace(made, open_loop=dear, feedback=dear)
     assert "2 certified chains make similar motions, at costs from 1 to 1.2" in str(unlike)
+
+
+FLOOR = '<geom type="plane" size="1 1 0.1" pos="0 0 -1"/>'
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_advice_tells_of_stops_that_joints_may_not_lean_on(stops, tmp_path):
+    """And they are what they were when the solution is loaded."""
+    problem = robot(arm(FLOOR), goal=lambda data: False, stops=stops)
+    made = made_up(problem)
+    missed = made.open_loop.violations
+    missed.size[:, KINDS.index(GOAL)], missed.allowed[:, KINDS.index(GOAL)] = 1.0, 0.0
+    lost = replace(made.open_loop, success=np.zeros(2, bool))
+    told = lines(replace(made, open_loop=lost, feedback=lost))[-1]
+    assert "miss the goal" in told
+    assert ("stops=True" in told) is not stops
+    made.save(tmp_path)
+    assert Solution.load(tmp_path).problem.dynamics.stops == ([0] if stops else [])

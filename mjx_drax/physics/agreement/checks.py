@@ -35,7 +35,13 @@ from mjx_drax.physics.contacts.collision import corners, hulls_of_one_size
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, touching
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
-from mjx_drax.physics.mjx_model import bounded_joints, free_ranges, has_limits, put_model
+from mjx_drax.physics.mjx_model import (
+    Stops,
+    bounded_joints,
+    free_ranges,
+    has_limits,
+    put_model,
+)
 from mjx_drax.physics.source import binary
 
 SINGULAR = 1e-10
@@ -73,7 +79,7 @@ decides whether they touch it."""
 
 
 def checked_start(
-    model: mujoco.MjModel, name: str, x_init: ArrayLike | None = None
+    model: mujoco.MjModel, name: str, x_init: ArrayLike | None = None, stops: Stops = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """x_0 (nx,), and the joints whose range becomes a bound on knots (njnt,); see `bounded_joints`.
 
@@ -81,15 +87,16 @@ def checked_start(
         model: to plan with.
         name: what errors call it.
         x_init: as given by the user; by default the first keyframe, else the default pose at rest.
+        stops: joints that may lean on their limits.
 
     Raises:
-        DraxError: the model cannot move, x_init does not fit it, or its acceleration cannot be
-            found there.
+        DraxError: stops cannot be used, the model cannot move, x_init does not fit it, or its
+            acceleration cannot be found there.
     """
     _require_movable(model, name)
     x0 = _initial_state(model, name, x_init)
     _require_regular(model, name, x0)
-    return x0, bounded_joints(model, x0)
+    return x0, bounded_joints(model, x0, stops)
 
 
 def _require_movable(model: mujoco.MjModel, name: str) -> None:

@@ -321,6 +321,7 @@ def _inner_dynamics(summary: dict[str, Any], arrays: Arrays, further: int) -> Dy
     mj_model, source = _model(summary, arrays)
     x_init = np.asarray(arrays["problem.x_init"], float)
     bounded = bounded_joints(mj_model, x_init[: mj_model.nq + mj_model.nv + mj_model.na])
+    bounded[summary.get("stops", [])] = False
     planned = put_model(mj_model, summary["contacts"], bounded)
     substeps = round(dt / mj_model.opt.timestep)
     return MjxDynamics(planned, dt, mj_model, substeps, origin=source)

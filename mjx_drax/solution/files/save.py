@@ -66,6 +66,7 @@ def summary(solution: Results) -> dict[str, Any]:
         "dt": float(solution.problem.dynamics.dt),
         "has_goal": solution.problem.goal is not None,
         "contacts": None if model is None else model.contacts,
+        "stops": [] if model is None else model.stops,
         "vector_states": dynamics.nx == dynamics.ndx and of_vectors,
         "names": {"x_names": own.x_names, "u_names": own.u_names},
         "free": solution.problem.free,
