@@ -11,8 +11,8 @@
   hull.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
   points on them.
-- Two polytopes touch at every point once, where MJX repeats some, and halfway between their faces;
-  hulls of meshes take less memory (`polytopes`).
+- Two polytopes touch where the C engine has it, at every point once, and halfway between their
+  faces; hulls of meshes take less memory (`polytopes`).
 - Hulls of meshes have the normals of their faces; see `polytope`. Pairs of hulls of similar sizes
   are one computation, where MJX has one for each pair, which takes seconds each to compile.
 - Pairs of geoms can be left out, by `exclude_signature` of the MJX model.
@@ -494,7 +494,7 @@ def with_corners(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Con
 
 
 def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Contacts:
-    """The same of boxes and meshes; `key.data_ids` as in `_merged`."""
+    """The same of boxes and meshes, of two boxes (8 n, ...); `key.data_ids` as in `_merged`."""
     stacks = [None if size < 0 else _alike(model, size) for size in key.data_ids]
     boxes = not any(stacks)
     margins = jnp.concatenate([jnp.asarray(model.geom_margin), jnp.asarray(model.pair_margin)])
@@ -564,7 +564,7 @@ _OWN = {
     (ELLIPSOID, MESH): _ELLIPSOIDS,
     (CYLINDER, BOX): _CYLINDERS,
     (CYLINDER, MESH): _CYLINDERS,
-    (BOX, BOX): _BETWEEN_HULLS,
+    (BOX, BOX): _function(between_hulls, 8),
     (BOX, MESH): _BETWEEN_HULLS,
     (MESH, MESH): _BETWEEN_HULLS,
 }

@@ -53,7 +53,10 @@ Contacts = tuple[Array, Array, Array]
 def contacts(
     one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = False, reach: ArrayLike = 0.0
 ) -> Contacts:
-    """Four contacts: distances (4,), positions (4, 3), and their normal (3,) from one to other.
+    """Contacts: distances (n,), positions (n, 3), and their normal (3,) from one to other.
+
+    Of boxes all eight that the faces may have, of others four: of more corners, those that span the
+    largest area.
 
     Args:
         one, other: in the same frame.
@@ -80,7 +83,15 @@ def contacts(
     first = of_one if boxes else jnp.ones((), bool)  # whose face clips the one of the other
     clipping, subject = (jnp.where(first, *pair) for pair in (faces, faces[::-1]))
     out, facing = (jnp.where(first, *pair) for pair in (normals, normals[::-1]))
-    dist, pos = _face_on_face(clipping, subject, out, facing, reach)
+    points, dist = _face_on_face(clipping, subject, out, facing, reach)
+    if not boxes:
+        chosen, new = _spanning(lax.stop_gradient(points), dist < APART, lax.stop_gradient(out))
+        points, dist = points[chosen], jnp.where(new, dist[chosen], APART)
+    # As in the C engine, faces touch halfway between both, those of boxes along the normal of the
+    # face with the least overlap, others along that of the second one
+    normal = axis if boxes else -normals[1]
+    above = jnp.where(dist < APART, dist, 0.0)[:, None]
+    pos = points - above * out + jnp.where(first, 0.5, -0.5) * above * normal
 
     def round_(_: int, found: tuple[Array, ...]) -> tuple[Array, ...]:
         p, q, gap = _edges(a, b, found[0])
@@ -90,10 +101,6 @@ def contacts(
     _, p, q, gap = lax.fori_loop(0, ROUNDS, round_, (direction, none, none, gaps[0]))
     top, across = jnp.max(gaps), _normal(one, other, p, q)
     nearer = gap > jnp.where(top < 0, LESS * top if boxes else top, top) + SAME
-    # As in the C engine, faces touch halfway between both, those of boxes along the normal of the
-    # face with the least overlap, others along that of the second one
-    normal = axis if boxes else -normals[1]
-    pos = pos + jnp.where(first, 0.5, -0.5) * dist[:, None] * normal
     (start, end), (begin, last) = one.vert[one.edge[p]], other.vert[other.edge[q]]
     points = closest_segment_to_segment_points(start, end, begin, last)
     depth, between = jnp.full_like(dist, APART), jnp.zeros_like(pos)
@@ -170,18 +177,16 @@ def _edges_on_face(
 def _slope(way: Array, normal: Array) -> Array:
     """|sine| of the angles of ways (n, 3) with faces that have normals; infinite for no way."""
     far = jnp.linalg.norm(way, axis=1)
-    return jnp.where(far > 0, jnp.abs(jnp.sum(way * normal, axis=1)), jnp.inf) / jnp.maximum(
-        far, 1e-12
-    )
+    rise = jnp.abs(jnp.sum(way * normal, axis=1))
+    return jnp.where(far > 0, rise / jnp.where(far > 0, far, 1.0), jnp.inf)
 
 
 def _face_on_face(
     clipping: Array, subject: Array, out: Array, facing: Array, reach: ArrayLike
 ) -> tuple[Array, Array]:
-    """Distances (4,) from a face of what is over it of another one, and positions (4, 3) on it.
+    """Corners (n, 3) of the part of a face that is over another one, and how far they are above it.
 
-    What is over it has a corner wherever, all around, an edge of one face begins to be over the
-    other face. Of more than four, those count that span the largest area.
+    There is one wherever, all around, an edge of one face begins to be over the other face.
 
     Args:
         clipping, subject: corners of the two faces (n, 3), counterclockwise.
@@ -199,9 +204,7 @@ def _face_on_face(
     acts = jnp.concatenate([own_part, other_part]) & (depth <= reach)
     close = jnp.max(jnp.abs(points[:, None] - points), axis=-1) < SAME
     acts &= ~jnp.any(jnp.tril(close, -1) & acts, axis=1)
-    chosen, new = _spanning(lax.stop_gradient(points), acts, lax.stop_gradient(out))
-    onto_face = points - depth[:, None] * out
-    return jnp.where(new, depth[chosen], APART), onto_face[chosen]
+    return points, jnp.where(acts, depth, APART)
 
 
 def _spanning(points: Array, acts: Array, out: Array) -> tuple[Array, Array]:
@@ -231,7 +234,8 @@ def _part(start: Array, end: Array, corners: Array, out: Array) -> tuple[Array, 
     first = jnp.max(jnp.where(rise < 0, share, 0.0), initial=0.0)
     last = jnp.min(jnp.where(rise > 0, share, 1.0), initial=1.0)
     some = (first <= last) & ~jnp.any((rise == 0) & (left < 0)) & jnp.any(start != end)
-    return start + jnp.stack([first, last])[:, None] * (end - start), some
+    along = jnp.clip(jnp.stack([first, last]), 0.0, 1.0)
+    return start + along[:, None] * (end - start), some
 
 
 def _edge_on_face(start: Array, end: Array, corners: Array, out: Array) -> tuple[Array, Array]:
