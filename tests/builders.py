@@ -280,3 +280,25 @@ def contacts_of(model):
         )
     )
     return lambda at: find(jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3))
+
+
+def assert_touch_alike(model, found, wanted, atol):
+    """The contacts of MJX that act are those of the C engine, in any order."""
+    acting = np.asarray(found.dist) < model.geom_margin.sum()
+    one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.pos))
+    for name in ("dist", "pos", "frame"):
+        here, there = (getattr(c, name) for c in (found, wanted))
+        there = there[other].reshape(here[acting].shape)
+        np.testing.assert_allclose(here[acting][one], there, atol=atol)
+
+
+def scattered(model, count):
+    """Data of the C engine with two free bodies in random poses about each other."""
+    import mujoco
+
+    at, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(count):
+        at.qpos[:] = rng.normal(size=14)
+        at.qpos[:3], at.qpos[7:10] = 0.0, rng.uniform(-0.2, 0.2, 3)
+        mujoco.mj_forward(model, at)
+        yield at

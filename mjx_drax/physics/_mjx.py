@@ -28,9 +28,6 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     from mujoco.mjx._src.collision_driver import (
         has_collision_fn as has_collision_fn,
     )
-    from mujoco.mjx._src.math import (
-        closest_segment_to_segment_points as closest_segment_to_segment_points,
-    )
     from mujoco.mjx._src.math import make_frame as make_frame
     from mujoco.mjx._src.types import ConvexMesh as ConvexMesh
 

@@ -18,6 +18,7 @@ from PIL import Image
 from mjx_drax.base.errors import DraxError
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.solution.names import difference_names
 from mjx_drax.solution.replay import WITH_FEEDBACK
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
@@ -195,6 +196,7 @@ def test_what_a_problem_leaves_open_is_named_and_drawn_at_the_motions_own_times(
 
 def test_phase_plots_of_turns_are_in_tangent_space(quadrotor: Dynamics) -> None:
     assert labels.coordinates(quadrotor)[2:4] == [("root z", "m"), ("root turn x", "rad")]
+    assert len(difference_names(quadrotor)) == 12
     angle = np.linspace(0.0, 3.0, 5)
     states = np.zeros((5, 13))
     states[:, 0], states[:, 12] = 2.0, 1.5

@@ -17,8 +17,7 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.physics._mjx import mjx
-from mjx_drax.physics.contacts.curved import APART
-from mjx_drax.physics.contacts.spheres import Contacts, length, nearest
+from mjx_drax.physics.contacts.spheres import APART, Contacts, length, nearest
 
 TINY = 1e-15
 """What counts as zero: distances of centres from boxes, differences of squares, as in C."""

@@ -46,6 +46,7 @@ from mjx_drax.physics._mjx import (
     with_internal,
 )
 from mjx_drax.physics.contacts import boxes, curved, polytopes, spheres
+from mjx_drax.physics.contacts.spheres import Contacts
 from mjx_drax.physics.engine import mujoco
 
 _GEOM = mujoco.mjtGeom
@@ -88,7 +89,6 @@ BLIND[:, MESH] = BLIND[HFIELD] = True
 BLIND[[PLANE, ELLIPSOID, CYLINDER], MESH] = False
 
 Pairs = Collection[tuple[int, int]]
-Contacts = tuple[Array, Array, Array]
 
 
 @contextlib.contextmanager

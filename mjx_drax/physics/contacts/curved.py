@@ -27,6 +27,8 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.physics._mjx import ConvexMesh, four_of
+from mjx_drax.physics.contacts.polytopes import inner_part
+from mjx_drax.physics.contacts.spheres import APART, Contacts
 from mjx_drax.physics.engine import mujoco
 
 _ANGLES = np.pi / 8 * np.arange(1, 16, 2)
@@ -46,11 +48,6 @@ TIE = 1e-7
 SEGMENTS = np.array(list(itertools.combinations(range(4), 2)))
 TRIANGLES = np.array(list(itertools.combinations(range(4), 3)))
 """Corners of the edges and faces of a simplex."""
-
-APART = 1.0
-"""Distance of contacts that do not act [m], as in MJX."""
-
-Contacts = tuple[Array, Array, Array]
 
 
 def cylinder(centre: Array, turn: Array, size: Array, hull: ConvexMesh) -> Contacts:
@@ -238,13 +235,8 @@ def _between(d: Array, sides: Array) -> Array:
 
 def _clipped(start: Array, end: Array, normals: Array, offsets: Array) -> Array:
     """The ends (2, 3) of the part of a segment that lies in a polytope."""
-    height, rise = offsets - normals @ start, normals @ (end - start)
-    flat = jnp.abs(rise) < 1e-9
-    share = height / jnp.where(flat, 1.0, rise)
-    first = jnp.max(jnp.where(~flat & (rise < 0), share, 0.0))
-    last = jnp.min(jnp.where(~flat & (rise > 0), share, 1.0))
+    shares, _ = inner_part(offsets - normals @ start, normals @ (end - start))
     inward = jnp.array([1e-6, -1e-6])  # not on a face, where rounding would decide
-    shares = jnp.clip(jnp.stack([first, last]), 0.0, 1.0)
     return start + (shares + inward)[:, None] * (end - start)
 
 

@@ -21,9 +21,9 @@ from jax.typing import ArrayLike
 
 from mjx_drax.physics._mjx import (
     ConvexMesh,
-    closest_segment_to_segment_points,
     make_frame,
 )
+from mjx_drax.physics.contacts.spheres import APART, Contacts, nearest_points
 
 AT_ONCE = 1 << 16
 """Pairs of a face and a corner that are compared at a time, for one state."""
@@ -41,13 +41,11 @@ FLAT, ALONG = 0.996, 0.0888
 """Cosine of the angle of two faces that touch as faces, and sine of that of an edge that touches
 a face in two points, as in the C engine (5 degrees)."""
 
+FLAT_RISE = 1e-9
+"""What a segment that is parallel to the border of a half-space may still rise."""
+
 PARALLEL = 1e-3
 """Sine of the angle below which two edges count as parallel."""
-
-APART = 1.0
-"""Distance of contacts that do not act [m], as in MJX."""
-
-Contacts = tuple[Array, Array, Array]
 
 
 def contacts(
@@ -80,7 +78,7 @@ def contacts(
     most = max(one.face.shape[1], other.face.shape[1])
     faces = _padded(one.face[i], most), _padded(other.face[j], most)
     normals = one.face_normal[i], other.face_normal[j]
-    first = of_one if boxes else jnp.ones((), bool)  # whose face clips the one of the other
+    first = of_one | (not boxes)  # whose face clips the one of the other
     clipping, subject = (jnp.where(first, *pair) for pair in (faces, faces[::-1]))
     out, facing = (jnp.where(first, *pair) for pair in (normals, normals[::-1]))
     points, dist = _face_on_face(clipping, subject, out, facing, reach)
@@ -102,10 +100,12 @@ def contacts(
     top, across = jnp.max(gaps), _normal(one, other, p, q)
     nearer = gap > jnp.where(top < 0, LESS * top if boxes else top, top) + SAME
     (start, end), (begin, last) = one.vert[one.edge[p]], other.vert[other.edge[q]]
-    points = closest_segment_to_segment_points(start, end, begin, last)
+    ends = nearest_points(
+        (start + end) / 2, (end - start) / 2, (begin + last) / 2, (last - begin) / 2
+    )
     depth, between = jnp.full_like(dist, APART), jnp.zeros_like(pos)
     depth = depth.at[0].set(across @ (begin - start))
-    between = between.at[0].set(0.5 * (points[0] + points[1]))
+    between = between.at[0].set(0.5 * (ends[0] + ends[1]))
     if not boxes:
         # Only faces that are nearly parallel touch as faces
         parallel = -lax.stop_gradient(normals[0] @ normals[1]) > FLAT
@@ -229,13 +229,23 @@ def _part(start: Array, end: Array, corners: Array, out: Array) -> tuple[Array, 
         corners, out: of the face (n, 3), counterclockwise about its normal (3,).
     """
     sides = jnp.cross(corners - jnp.roll(corners, 1, axis=0), out)
-    rise, left = sides @ (end - start), jnp.sum(sides * (corners - start), axis=1)
-    share = left / jnp.where(rise == 0, 1.0, rise)
-    first = jnp.max(jnp.where(rise < 0, share, 0.0), initial=0.0)
-    last = jnp.min(jnp.where(rise > 0, share, 1.0), initial=1.0)
-    some = (first <= last) & ~jnp.any((rise == 0) & (left < 0)) & jnp.any(start != end)
-    along = jnp.clip(jnp.stack([first, last]), 0.0, 1.0)
-    return start + along[:, None] * (end - start), some
+    left, rise = jnp.sum(sides * (corners - start), axis=1), sides @ (end - start)
+    along, some = inner_part(left, rise)
+    return start + along[:, None] * (end - start), some & jnp.any(start != end)
+
+
+def inner_part(height: Array, rise: Array) -> tuple[Array, Array]:
+    """Where a segment enters and leaves all of n half-spaces, (2,) in [0, 1], and if it does.
+
+    Args:
+        height, rise: how far its start is inside of each, and how much less its end is, (n,).
+    """
+    flat = jnp.abs(rise) < FLAT_RISE
+    share = height / jnp.where(flat, 1.0, rise)
+    first = jnp.max(jnp.where(~flat & (rise < 0), share, 0.0), initial=0.0)
+    last = jnp.min(jnp.where(~flat & (rise > 0), share, 1.0), initial=1.0)
+    inside = (first <= last) & ~jnp.any(flat & (height < 0))
+    return jnp.clip(jnp.stack([first, last]), 0.0, 1.0), inside
 
 
 def _edge_on_face(start: Array, end: Array, corners: Array, out: Array) -> tuple[Array, Array]:

@@ -14,6 +14,9 @@ from mjx_drax.physics._mjx import mjx
 PARALLEL = 1e-12
 """Squared sine of the angle below which capsules count as parallel."""
 
+APART = 1.0
+"""Distance of contacts that do not act [m], as in MJX."""
+
 Contacts = tuple[Array, Array, Array]
 """Distances (n,), positions (n, 3), and normals (n, 3) from the first geom to the second."""
 
@@ -32,8 +35,7 @@ def two_capsules(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
     """Nearest points m + s h of both axes, with -1 <= s <= 1, are centres of spheres."""
     one, other = geom.T
     (m1, h1), (m2, h2) = (_axis(model, data, g) for g in (one, other))
-    _, s, t, _ = nearest(m1 - m2, h1, h2)
-    points = m1 + jnp.clip(s, -1.0, 1.0)[:, None] * h1, m2 + t[:, None] * h2
+    points = nearest_points(m1, h1, m2, h2)
     radii = model.geom_size[one, 0], model.geom_size[other, 0]
     return _spheres(points[0], radii[0], points[1], radii[1])
 
@@ -61,6 +63,12 @@ def sphere_cylinder(model: mjx.Model, data: mjx.Data, geom: Array) -> Contacts:
         jnp.where(end if one.ndim == 1 else end[:, None], one, other)
         for one, other in zip(flat, found, strict=True)
     )
+
+
+def nearest_points(m1: Array, h1: Array, m2: Array, h2: Array) -> tuple[Array, Array]:
+    """The nearest points (..., 3) of two segments with middles m and halves h, (..., 3)."""
+    _, s, t, _ = nearest(m1 - m2, h1, h2)
+    return m1 + jnp.clip(s, -1.0, 1.0)[..., None] * h1, m2 + t[..., None] * h2
 
 
 def nearest(apart: Array, one: Array, other: Array) -> tuple[Array, Array, Array, Array]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import contacts_of
+from builders import assert_touch_alike, contacts_of
 
 from mjx_drax.physics._mjx import COLLISIONS, collision_driver, mjx
 from mjx_drax.physics.contacts import polytopes
@@ -28,16 +28,6 @@ BOX = """
     <body><freejoint/><geom type="box" size="0.1 0.2 0.3" margin="0.02"/></body>
   </worldbody>
 </mujoco>"""
-
-
-def assert_touch_alike(model, found, wanted, atol):
-    """The contacts of MJX that act are those of the C engine, in any order."""
-    acting = np.asarray(found.dist) < model.geom_margin.sum()
-    one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.pos))
-    for name in ("dist", "pos", "frame"):
-        here, there = (getattr(c, name) for c in (found, wanted))
-        there = there[other].reshape(here[acting].shape)
-        np.testing.assert_allclose(here[acting][one], there, atol=atol)
 
 
 def test_a_box_stands_on_the_corners_that_the_c_engine_has():
@@ -229,12 +219,7 @@ def test_a_box_lies_on_a_box_however_its_sides_lie_as_in_the_c_engine():
             turn = 0.3 * len(counts)
             at.qpos[:] = [0.01, 0.02, 0.0885, 1, *rng.normal(size=2) * tilt, turn]
             mujoco.mj_forward(model, at)
-            found = find(at)
-            acts = np.asarray(found.dist) < 0
-            assert acts.sum() == at.ncon
-            np.testing.assert_allclose(
-                np.sort(np.asarray(found.dist)[acts]), np.sort(at.contact.dist), atol=1e-6
-            )
+            assert_touch_alike(model, find(at), at.contact, 1e-6)
             counts.add(at.ncon)
     assert counts >= {4, 8}
 
@@ -260,12 +245,7 @@ def test_a_box_lies_on_a_box_as_in_the_c_engine():
         for tilt in [0.0] + [0.01] * 20:
             wanted.qpos[:] = [0.01, 0.02, 0.2395, 1, *rng.normal(size=3) * tilt]
             mujoco.mj_forward(model, wanted)
-            found, there = find(wanted), wanted.contact
-            acting = np.asarray(found.dist) < 0
-            one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], there.pos))
-            for name in ("dist", "pos", "frame"):
-                here, c = getattr(found, name)[acting][one], getattr(there, name)[other]
-                np.testing.assert_allclose(here, c.reshape(here.shape), atol=1e-9)
+            assert_touch_alike(model, find(wanted), wanted.contact, 1e-9)
             counts.add(wanted.ncon)
     assert counts >= {2, 3, 4}
 

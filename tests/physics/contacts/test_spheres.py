@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import contacts_of
+from builders import assert_touch_alike, contacts_of, scattered
 
 from mjx_drax.physics.contacts import spheres
 from mjx_drax.physics.contacts.collision import make_data
@@ -40,20 +40,12 @@ def paired(one, other):
     ],
 )
 def test_they_touch_as_in_the_c_engine_also_deep_inside(one, other):
-    model, rng, seen = paired(one, other), np.random.default_rng(0), []
+    model, seen = paired(one, other), []
     with jax.enable_x64(True):
-        find, at = contacts_of(model), mujoco.MjData(model)
-        for _ in range(400):
-            at.qpos[:] = rng.normal(size=14)
-            at.qpos[:3], at.qpos[7:10] = 0.0, rng.uniform(-0.2, 0.2, 3)
-            mujoco.mj_forward(model, at)
-            contact = find(at)
-            assert (contact.dist[0] < 0.01) == (at.ncon == 1)
-            if at.ncon:
-                seen.append(at.contact.dist[0])
-                for name in ("dist", "pos", "frame"):
-                    here, there = (np.ravel(getattr(c, name)) for c in (contact, at.contact))
-                    np.testing.assert_allclose(here, there, atol=1e-12)
+        find = contacts_of(model)
+        for at in scattered(model, 400):
+            assert_touch_alike(model, find(at), at.contact, 1e-12)
+            seen.extend(at.contact.dist)
     assert len(seen) > 30
     assert min(seen) < -0.03
 
