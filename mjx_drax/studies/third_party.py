@@ -1,7 +1,7 @@
 """Models that others wrote, as they are installed, or as they lie in a folder.
 
     python -m mjx_drax.studies.third_party [NAME ...] [--path DIR] [--chains N] [--seed S]
-                                           [--timeout S] [--out DIR]
+                                           [--timeout S] [--jobs N] [--out DIR]
 
 Each is either solved (`postures.reach`, default settings) or refused with a reason; a Markdown
 table says which, and another one counts the reasons. With `--chains 0` nothing is solved: the table
@@ -21,6 +21,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--chains", type=int, default=16, help="0: only look which are usable")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--timeout", type=float, default=600.0, metavar="SECONDS")
+    parser.add_argument("--jobs", type=int, default=1, help="models at the same time (1)")
     parser.add_argument("--out", metavar="DIR", help="where third_party.json goes")
     parser.add_argument("--here", type=Path, metavar="FILE", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -228,9 +230,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         names = ", ".join(known) or 'none: pip install "mjx-drax[third-party]"'
         print(f"there is no model {', '.join(unknown)}: there is {names}.", file=sys.stderr)
         return 2
-    rest = options.chains, options.seed, options.timeout
-    measured = (measure_apart(name, known[name], *rest) for name in options.names or known)
-    rows = told(measured, options.out and Path(options.out) / "third_party.json")
+
+    def row_of(name: str) -> Row:
+        rest = options.chains, options.seed, options.timeout
+        return measure_apart(name, known[name], *rest)
+
+    with ThreadPoolExecutor(options.jobs) as jobs:
+        measured = jobs.map(row_of, options.names or known)
+        rows = told(measured, options.out and Path(options.out) / "third_party.json")
     print(f"\n{causes(rows)}", flush=True)
     return 0 if all(map(fine, rows)) else 1
 
