@@ -161,9 +161,7 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
         # Otherwise MJX refuses geoms that it cannot collide
         model.geom_contype[:] = 0
         model.geom_conaffinity[:] = 0
-    held = model.dof_damping * opt.timestep > HELD * model.dof_M0
-    model.dof_armature[held] += opt.timestep * model.dof_damping[held]  # as the integrator does
-    model.dof_damping[held] = 0.0
+    hold_by_inertia(model)
     touching = _pairs(model, without)
     if not touching or max([*model.geom_condim, *model.pair_dim]) == 1:
         # No contact has friction, and MJX fails if elliptic cones are asked for and there are none
@@ -182,6 +180,15 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
     unknown = unknown_sensors(model)
     model.sensor_type[unknown] = int(mujoco.mjtSensor.mjSENS_CLOCK)
     model.sensor_intprm[unknown, 0] = NOT_COMPUTED  # clocks have none
+
+
+def hold_by_inertia(model: mujoco.MjModel) -> np.ndarray:
+    """Change a model as `HELD` says; the degrees of freedom that are held, (nv,)."""
+    held = np.asarray(model.dof_damping * model.opt.timestep > HELD * model.dof_M0)
+    # as the integrator does
+    model.dof_armature[held] += model.opt.timestep * model.dof_damping[held]
+    model.dof_damping[held] = 0.0
+    return held
 
 
 def _pairs(model: mujoco.MjModel, without: set[Pair]) -> list[tuple[int, int, int]]:

@@ -208,7 +208,8 @@ def test_no_velocities_are_drawn_where_damping_ends_them_within_a_step():
       <body><joint name="arm" damping="1" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body>
     </body></worldbody><actuator><motor joint="arm"/></actuator></mujoco>
     """
-    task = from_mjcf(held, horizon=0.2, running_cost=lambda data, u: u @ u)
+    with pytest.warns(DraxWarning, match="damping holds base, and in a plan inertia does"):
+        task = from_mjcf(held, horizon=0.2, running_cost=lambda data, u: u @ u)
     np.testing.assert_array_equal(task.scatter.x_upper[2:], [0.0, 5.0])
 
 

@@ -352,6 +352,28 @@ HELD = """
   <body name="d" pos=".8 .5 1"><joint type="slide" axis="1 1 0"/><joint axis="0 0 1"/>
     <geom size=".04" pos="0 0 -.2" mass=".3"/></body>
   <site name="fixed" pos=".8 0 1"/></worldbody><equality>{equalities}</equality></mujoco>"""
+DAMPED = """
+<mujoco><worldbody>
+  <body name="hand" pos=".5 0 .6" mocap="true"/>
+  <body><joint name="base" type="slide" axis="0 0 1" damping="1e11"/><geom size=".1" mass="50"/>
+    <body><joint name="lift" type="slide" axis="0 0 1" range=".03 .3" limited="true"/>
+      <geom size=".1" mass="20"/><body><joint name="arm" axis="0 1 0"/>
+        <geom type="capsule" size=".03" fromto="0 0 0 .5 0 0"/><body name="tip" pos=".5 0 0">
+          <joint axis="0 1 0"/><geom size=".02"/></body></body></body></body>
+</worldbody><equality><weld body1="hand" body2="tip"/></equality>
+<actuator><motor joint="arm"/></actuator></mujoco>"""
+
+
+def test_a_base_that_damping_holds_is_held_by_inertia_in_both_engines():
+    """Until its load has settled the C engine lets it fall, in the sum of forces of constraints."""
+    model = mujoco.MjModel.from_xml_string(DAMPED)
+    x, bounded = np.zeros(2 * model.nv), np.zeros(model.njnt, bool)
+    found = examine(model, "robot", x, True, bounded, None)
+    assert found.errors.velocity.max() < 1e-9
+    assert any("damping holds base" in note for note in found.notes)
+    assert model.dof_damping[0] == 1e11
+
+
 EQUALITIES = """
   <weld body1="d" body2="c" torquescale=".3"/><connect body1="b" body2="c" anchor=".4 0 0"/>
   <connect site1="b" site2="fixed" active="{active}"/><weld site1="b" site2="c"/>

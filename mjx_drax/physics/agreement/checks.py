@@ -40,6 +40,7 @@ from mjx_drax.physics.mjx_model import (
     bounded_joints,
     free_ranges,
     has_limits,
+    hold_by_inertia,
     put_model,
 )
 from mjx_drax.physics.source import binary
@@ -423,8 +424,11 @@ def _examined(
     kept: int | None,
     derivatives: bool,
 ) -> Findings:
+    _require_stable(Engine(model, contacts), name, x_init)
+    left_out = set_aside(model)
+    model = copy.deepcopy(model)
+    hold_by_inertia(model)
     engine = Engine(model, contacts)
-    _require_stable(engine, name, x_init)
     at = samples(engine, x_init, bounded)
     if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         bounded = np.zeros_like(bounded)  # its stages leave a range that a state is in
@@ -437,7 +441,7 @@ def _examined(
     notes: list[str | None] = [
         _beyond_limits(model, name, x_init),
         _just_touching(engine, name, x_init, at.u),
-        *(f"{name}: {sentence}." for sentence in set_aside(model)),
+        *(f"{name}: {sentence}." for sentence in left_out),
         _other_physics(model, name, at, contacts),
     ]
     if lost:
@@ -531,7 +535,9 @@ def _other_physics(model: mujoco.MjModel, name: str, at: Samples, contacts: Cont
     opt = model.opt
     return (
         f"{name} has its contact solver stop early (iterations={opt.iterations}, "
-        f"ls_iterations={opt.ls_iterations}, tolerance={opt.tolerance:g}): velocities after a step "
-        f"are up to {error:.1e} off. The plan and the certificate have the solver converge; set "
-        f'<option solver="Newton" iterations="100" ls_iterations="50"/> to simulate the same.'
+        f"ls_iterations={opt.ls_iterations}, tolerance={opt.tolerance:g}, "
+        f"ccd_iterations={opt.ccd_iterations}): velocities after a step are up to {error:.1e} off. "
+        "The plan and the certificate have the solver converge; set <option "
+        'solver="Newton" iterations="100" ls_iterations="50" ccd_iterations="200"/> to simulate '
+        "the same."
     )

@@ -6,6 +6,7 @@ the engines with it and without it.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ from mjx_drax.physics.mjx_model import (
     LIMIT,
     OTHER_CONTACTS,
     PAIRS,
+    hold_by_inertia,
     unknown_sensors,
 )
 
@@ -144,6 +146,13 @@ def set_aside(model: mujoco.MjModel) -> list[str]:
     found = []
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         found.append("bodies do not fall asleep in a plan: clear the flag sleep")
+    held = hold_by_inertia(copy.deepcopy(model))
+    if held.any():
+        joints = [str(model.joint(j).name or j) for j in np.unique(model.dof_jntid[held])]
+        found.append(
+            f"damping holds {', '.join(joints)}, and in a plan inertia does: when the load changes "
+            "quickly, forces of limits and equality constraints differ until it has settled"
+        )
     customs = [model.numeric(i).name for i in range(model.nnumeric)]
     given = " and ".join(name for name in (PAIRS, LIMIT) if name in customs)
     if given:

@@ -159,11 +159,20 @@ def without(pairs: Collection[Pair]) -> Iterator[None]:
             mujoco.set_mjcb_contactfilter(before)
 
 
-CONVERGED = {"iterations": 200, "ls_iterations": 100, "tolerance": 1e-12, "ls_tolerance": 0.01}
-"""Options at which the C engine's contact solver, Newton's method, ends at the minimum.
+CONVERGED = {
+    "iterations": 200,
+    "ls_iterations": 100,
+    "tolerance": 1e-12,
+    "ls_tolerance": 0.01,
+    "ccd_iterations": 200,
+    "ccd_tolerance": 1e-6,
+}
+"""Options at which the C engine's contact solver, Newton's method, ends at the minimum, and its
+search for contacts of meshes at the least overlap.
 
 In nine models (humanoids, a dog, walkers, a pushed block) it took at most eleven iterations, and
-velocities were within 3e-13 of those after a thousand."""
+velocities were within 3e-13 of those after a thousand. Of hulls that overlap by 8 cm, 35 iterations,
+MuJoCo's default, found one contact where there are four."""
 
 
 def converged(model: mujoco.MjModel) -> mujoco.MjModel:

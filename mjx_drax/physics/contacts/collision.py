@@ -26,18 +26,17 @@ import itertools
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextvars import ContextVar
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from mjx_drax.physics._mjx import (
     COLLISIONS,
-    ConvexMesh,
     collision_driver,
     internal,
     make_frame,
@@ -46,6 +45,7 @@ from mjx_drax.physics._mjx import (
     with_internal,
 )
 from mjx_drax.physics.contacts import boxes, curved, polytopes, spheres
+from mjx_drax.physics.contacts.hull import Hull, hull_of, polytope
 from mjx_drax.physics.contacts.spheres import Contacts
 from mjx_drax.physics.engine import mujoco
 
@@ -58,9 +58,6 @@ PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
 SIDES = 16
 """Sides of the prism that stands for a cylinder. The C engine lets cylinders stand on 8 points at
 odd multiples of 22.5 degrees, which are corners of it."""
-
-MOST_CORNERS = 20
-"""Corners of a face, at most, as in MJX; from larger faces every second or third is taken."""
 
 STEEP, UPRIGHT = 0.1, 1e-6
 """Cosines of a capsule's angle with a plane: below the first its directions of friction count as
@@ -124,14 +121,10 @@ def extended(left_out: Pairs = ()) -> Iterator[None]:
             out |= {int(s) for s in model.exclude_signature if s < 0}
             yield from (pair for pair in pairs(model) if signature(*pair[:2]) not in out)
 
-        def hull(model: Any, which: int) -> ConvexMesh:
-            found = hull_of(model, which)
-            return convex(model, which) if found is None else found
-
         COLLISIONS.update(_OWN)
         collision_driver.geom_pairs = kept
         collision_driver._geom_groups = lambda model: _merged(model, groups(model))
-        meshes.convex = hull
+        meshes.convex = hull_of
         try:
             yield
         finally:
@@ -162,12 +155,12 @@ def _merged(model: Any, groups: dict[Any, list[Any]]) -> dict[Any, list[Any]]:
     return {key: sorted(pairs, key=lambda pair: pair[2] < 0) for key, pairs in merged.items()}
 
 
-def _size(hull: ConvexMesh) -> int:
+def _size(hull: Hull) -> int:
     """The power of `_GROWTH` that a hull's number of corners is below."""
     return int(np.ceil(np.log(len(hull.vert)) / np.log(_GROWTH.get())))
 
 
-def _alike(model: mjx.Model, size: int) -> tuple[ConvexMesh, np.ndarray]:
+def _alike(model: mjx.Model, size: int) -> tuple[Hull, np.ndarray]:
     """All hulls of a size, padded and stacked, and the place of each mesh among them (nmesh,).
 
     Corners, faces and edges are repeated; edges that are have no faces beside them, and so touch
@@ -178,7 +171,7 @@ def _alike(model: mjx.Model, size: int) -> tuple[ConvexMesh, np.ndarray]:
     hulls = [jax.tree.map(jnp.asarray, every[i]) for i in of_size]
     most = jax.tree.map(lambda *arrays: tuple(np.max([a.shape for a in arrays], axis=0)), *hulls)
 
-    def padded(hull: ConvexMesh) -> ConvexMesh:
+    def padded(hull: Hull) -> Hull:
         def pad(array: Array, shape: tuple[int, ...], mode: str = "edge") -> Array:
             missing = [(0, int(n) - m) for n, m in zip(shape, array.shape, strict=True)]
             return jnp.pad(array, missing, mode)
@@ -302,7 +295,7 @@ def plane_mesh(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Conta
 plane_mesh.ncon = 4  # type: ignore[attr-defined]
 
 
-def _on_plane(mesh: ConvexMesh, origin: Array, turn: Array, centre: Array, own: Array) -> Contacts:
+def _on_plane(mesh: Hull, origin: Array, turn: Array, centre: Array, own: Array) -> Contacts:
     """Contacts (4, ...) of one hull with one plane: where each is, and how it is turned."""
     normal = turn[:, 2]
     down = -normal @ own
@@ -347,47 +340,6 @@ def _spread(corners: Array, first: Array, count: Array) -> Array:
     return (start + jnp.stack([a, b, c, d])) % count
 
 
-def polytope(points: np.ndarray) -> ConvexMesh:
-    """The convex hull of points (n, 3), as MJX has it of a mesh.
-
-    MJX itself merges triangles that are nearly in a plane, and leaves out corners of large faces
-    before it finds their normals: of 276 meshes of robots, 221 had a corner outside of a face, by
-    more than 1/1000 of their size.
-    """
-    size = np.abs(points).max()
-    hull = ConvexHull(points / size)
-    planes: dict[tuple[float, ...], list[int]] = {}
-    for t, plane in enumerate(hull.equations):
-        planes.setdefault(tuple((plane + 0.0).round(5) + 0.0), []).append(t)
-    normals = np.array([hull.equations[same[0], :3] for same in planes.values()])
-    faces = [
-        _around(points, np.unique(hull.simplices[same]), normal)
-        for same, normal in zip(planes.values(), normals, strict=True)
-    ]
-    beside: dict[tuple[int, int], list[int]] = {}
-    for f, face in enumerate(faces):
-        for pair in zip(face, np.roll(face, -1), strict=True):
-            beside.setdefault((int(min(pair)), int(max(pair))), []).append(f)
-    beside = {pair: both for pair, both in beside.items() if len(both) == 2}
-    faces = [face[:: -(-len(face) // MOST_CORNERS)] for face in faces]
-    most = max(map(len, faces))
-    padded = np.array([np.pad(face, (0, most - len(face)), "edge") for face in faces])
-    return ConvexMesh(
-        points,
-        points[padded],
-        normals,
-        np.array(list(beside)),
-        normals[np.array(list(beside.values()))],
-    )
-
-
-def _around(points: np.ndarray, corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Corners of a face in counterclockwise order about its normal."""
-    out = points[corners] - points[corners].mean(axis=0)
-    angle = np.arctan2(np.cross(out[0], out) @ normal, out @ out[0])
-    return corners[np.argsort(angle)]
-
-
 def corners(model: mujoco.MjModel, g: int) -> int:
     """How many corners the hull of a geom has; 1 where it is none."""
     kind, mesh = int(model.geom_type[g]), int(model.geom_dataid[g])
@@ -396,25 +348,8 @@ def corners(model: mujoco.MjModel, g: int) -> int:
     return int(model.mesh_graph[model.mesh_graphadr[mesh]])
 
 
-def hull_of(model: mujoco.MjModel, which: int) -> ConvexMesh | None:
-    """The hull of a mesh, on the corners that the C engine has; None if it is flat."""
-    graph = model.mesh_graph[model.mesh_graphadr[which] :]
-    own = graph[2 + graph[0] : 2 + 2 * graph[0]]
-    vertices = model.mesh_vert[model.mesh_vertadr[which] + own]
-    try:
-        return _polytope_of(np.asarray(vertices, float).tobytes())
-    except QhullError:
-        return None
-
-
-@lru_cache(1000)
-def _polytope_of(points: bytes) -> ConvexMesh:
-    """`polytope`, which takes a tenth of a second for a mesh of 500 corners."""
-    return polytope(np.frombuffer(points).reshape(-1, 3))
-
-
 @cache
-def _unit_hull(kind: int) -> ConvexMesh:
+def _unit_hull(kind: int) -> Hull:
     """A hull for geoms of size 1."""
     points = CORNERS
     if kind == CYLINDER:
@@ -431,23 +366,25 @@ def _unit_hull(kind: int) -> ConvexMesh:
     return polytope(points)
 
 
-def _hull(kind: int, size: Array) -> ConvexMesh:
+def _hull(kind: int, size: Array) -> Hull:
     """The hull that stands for a geom of a size (3,)."""
     # Constants of its own for each precision: JAX may take one for the other
-    unit = jax.tree.map(lambda array: jnp.asarray(array, size.dtype), _unit_hull(kind))
-    unit = unit.replace(edge=_unit_hull(kind).edge.astype(np.int32))
+    unit = jax.tree.map(
+        lambda array: jnp.asarray(array, size.dtype if array.dtype == float else np.int32),
+        _unit_hull(kind),
+    )
     scale = size[jnp.array([0, 0, 1])] if kind == CYLINDER else size
 
     def turned(normals: Array) -> Array:
         scaled = normals / scale
         return scaled / jnp.linalg.norm(scaled, axis=-1, keepdims=True)
 
-    return ConvexMesh(
-        unit.vert * scale,
-        unit.face * scale,
-        turned(unit.face_normal),
-        unit.edge,
-        turned(unit.edge_face_normal),
+    return unit.replace(
+        vert=unit.vert * scale,
+        face=unit.face * scale,
+        face_normal=turned(unit.face_normal),
+        edge_face_normal=turned(unit.edge_face_normal),
+        polygon_normal=turned(unit.polygon_normal),
     )
 
 
@@ -498,9 +435,9 @@ def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Co
     stacks = [None if size < 0 else _alike(model, size) for size in key.data_ids]
     boxes = not any(stacks)
     margins = jnp.concatenate([jnp.asarray(model.geom_margin), jnp.asarray(model.pair_margin)])
-    reach = jnp.max(margins) if boxes else 0.0
+    reach = jnp.max(margins)
 
-    def hull(place: int, g: Array) -> ConvexMesh:
+    def hull(place: int, g: Array) -> Hull:
         stack = stacks[place]
         if stack is None:
             return _hull(BOX, model.geom_size[g])
@@ -512,7 +449,11 @@ def between_hulls(model: mjx.Model, data: mjx.Data, key: Any, geom: Array) -> Co
         turn, origin = data.geom_xmat[other], data.geom_xpos[other]
         centre, axes = turn.T @ (data.geom_xpos[one] - origin), turn.T @ data.geom_xmat[one]
         placed = polytopes.moved(hull(0, one), centre, axes)
-        dist, pos, normal = polytopes.contacts(placed, hull(1, other), len(geom), boxes, reach)
+        if boxes:
+            found = polytopes.of_boxes(placed, hull(1, other), len(geom), reach)
+        else:
+            found = polytopes.of_hulls(placed, hull(1, other), len(geom))
+        dist, pos, normal = found
         frame = jnp.repeat(make_frame(turn @ normal)[None], len(dist), axis=0)
         return dist, pos @ turn.T + origin, frame
 

@@ -14,15 +14,15 @@ one.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from mjx_drax.physics._mjx import (
-    ConvexMesh,
-    make_frame,
-)
+from mjx_drax.physics._mjx import ConvexMesh, make_frame
+from mjx_drax.physics.contacts.hull import Hull
 from mjx_drax.physics.contacts.spheres import APART, Contacts, nearest_points
 
 AT_ONCE = 1 << 16
@@ -31,8 +31,8 @@ AT_ONCE = 1 << 16
 EDGES, ROUNDS = 48, 2
 """Edges of each polytope that are compared; and how often, each time about the best direction."""
 
-SAME = 1e-6
-"""Depths that are not different [m]."""
+SAME, TIED = 1e-6, 1e-7
+"""Points that are one, and depths that are not different [m]."""
 
 LESS = 0.95
 """How many times less than a face edges of boxes must overlap to be what touches, as in C."""
@@ -48,75 +48,147 @@ PARALLEL = 1e-3
 """Sine of the angle below which two edges count as parallel."""
 
 
-def contacts(
-    one: ConvexMesh, other: ConvexMesh, alike: int = 1, boxes: bool = False, reach: ArrayLike = 0.0
-) -> Contacts:
-    """Contacts: distances (n,), positions (n, 3), and their normal (3,) from one to other.
+class _Nearest(NamedTuple):
+    """The direction of least overlap.
 
-    Of boxes all eight that the faces may have, of others four: of more corners, those that span the
-    largest area.
-
-    Args:
-        one, other: in the same frame.
-        alike: so many pairs of a state are computed at once, by `jax.vmap`.
-        boxes: whether both are boxes, which the C engine has functions of their own for.
-        reach: how far apart boxes still touch [m]; others touch where they overlap.
+    Attributes:
+        axis: normal of the face with the least overlap, from one to the other, (3,).
+        of_one, face: whether it is of the first polytope, and its number.
+        across, edges: normal across the two edges with the least overlap, and their numbers.
+        cross: whether these overlap less than the face.
+        gap: least overlap of a face, negative.
     """
-    one, other = jax.tree.map(jnp.asarray, (one, other))
+
+    axis: Array
+    of_one: Array
+    face: Array
+    across: Array
+    edges: tuple[Array, Array]
+    cross: Array
+    gap: Array
+
+
+def _nearest(one: Hull, other: Hull, alike: int, less: float) -> _Nearest:
     a, b = lax.stop_gradient((one, other))
     at_once = AT_ONCE // alike
     gaps = jnp.concatenate([_gaps(a, b.vert, at_once), _gaps(b, a.vert, at_once)])
-    best = jnp.argmax(gaps)
-    of_one, count = best < len(a.face), len(a.face)
-    axis = jnp.where(
-        of_one,
-        one.face_normal[jnp.minimum(best, count - 1)],
-        -other.face_normal[jnp.maximum(best - count, 0)],
-    )
-    direction = lax.stop_gradient(axis)
-    i, j = jnp.argmax(a.face_normal @ direction), jnp.argmin(b.face_normal @ direction)
-    most = max(one.face.shape[1], other.face.shape[1])
-    faces = _padded(one.face[i], most), _padded(other.face[j], most)
-    normals = one.face_normal[i], other.face_normal[j]
-    first = of_one | (not boxes)  # whose face clips the one of the other
-    clipping, subject = (jnp.where(first, *pair) for pair in (faces, faces[::-1]))
-    out, facing = (jnp.where(first, *pair) for pair in (normals, normals[::-1]))
-    points, dist = _face_on_face(clipping, subject, out, facing, reach)
-    if not boxes:
-        chosen, new = _spanning(lax.stop_gradient(points), dist < APART, lax.stop_gradient(out))
-        points, dist = points[chosen], jnp.where(new, dist[chosen], APART)
-    # As in the C engine, faces touch halfway between both, those of boxes along the normal of the
-    # face with the least overlap, others along that of the second one
-    normal = axis if boxes else -normals[1]
-    above = jnp.where(dist < APART, dist, 0.0)[:, None]
-    pos = points - above * out + jnp.where(first, 0.5, -0.5) * above * normal
+    best, count = jnp.argmax(gaps), len(a.face)
+    of_one = best < count
+    face = jnp.where(of_one, best, best - count)
+    # Of the polytope that the face is not of, the last face is read, and not used
+    axis = jnp.where(of_one, one.face_normal[face], -other.face_normal[face])
 
     def round_(_: int, found: tuple[Array, ...]) -> tuple[Array, ...]:
         p, q, gap = _edges(a, b, found[0])
         return jnp.where(jnp.isfinite(gap), _normal(a, b, p, q), found[0]), p, q, gap
 
     none = jnp.zeros((), jnp.int32)
-    _, p, q, gap = lax.fori_loop(0, ROUNDS, round_, (direction, none, none, gaps[0]))
-    top, across = jnp.max(gaps), _normal(one, other, p, q)
-    nearer = gap > jnp.where(top < 0, LESS * top if boxes else top, top) + SAME
-    (start, end), (begin, last) = one.vert[one.edge[p]], other.vert[other.edge[q]]
+    start = lax.stop_gradient(axis), none, none, gaps[0]
+    _, p, q, gap = lax.fori_loop(0, ROUNDS, round_, start)
+    top = jnp.max(gaps)
+    cross = gap > jnp.where(top < 0, less * top, top) + TIED
+    return _Nearest(axis, of_one, face, _normal(one, other, p, q), (p, q), cross, top)
+
+
+def of_boxes(one: Hull, other: Hull, alike: int = 1, reach: ArrayLike = 0.0) -> Contacts:
+    """Contacts of two boxes: distances (8,), positions (8, 3), and their normal (3,).
+
+    Args:
+        one, other: in the same frame; the normal leads from one to the other.
+        alike: so many pairs of a state are computed at once, by `jax.vmap`.
+        reach: how far apart they still touch [m].
+    """
+    one, other = jax.tree.map(jnp.asarray, (one, other))
+    near = _nearest(one, other, alike, LESS)
+    known, first = lax.stop_gradient(near.axis), near.of_one  # whose face clips the other's
+    i, j = (
+        jnp.argmax(lax.stop_gradient(hull.face_normal) @ out)
+        for hull, out in ((one, known), (other, -known))
+    )
+    faces, normals = (one.face[i], other.face[j]), (one.face_normal[i], other.face_normal[j])
+    clipping, subject = (jnp.where(first, *pair) for pair in (faces, faces[::-1]))
+    out, facing = (jnp.where(first, *pair) for pair in (normals, normals[::-1]))
+    points, dist = _face_on_face(clipping, subject, out, facing, reach)
+    # As in the C engine, halfway between both along the normal of the face with the least overlap
+    above = jnp.where(dist < APART, dist, 0.0)[:, None]
+    pos = points - above * out + jnp.where(first, 0.5, -0.5) * above * near.axis
+    crossing = _crossing(one, other, near, len(dist))
+    dist, pos, normal = _either(near.cross, crossing, (dist, pos, near.axis))
+    return jnp.where(near.gap > reach, APART, dist), pos, normal
+
+
+def of_hulls(one: Hull, other: Hull, alike: int = 1) -> Contacts:
+    """Contacts of two polytopes that overlap: distances (4,), positions (4, 3), the normal (3,).
+
+    Of faces with more than four corners in common, those that span the largest area.
+
+    Args:
+        one, other: in the same frame; the normal leads from one to the other.
+        alike: so many pairs of a state are computed at once, by `jax.vmap`.
+    """
+    one, other = jax.tree.map(jnp.asarray, (one, other))
+    near, (a, b) = _nearest(one, other, alike, 1.0), lax.stop_gradient((one, other))
+    known, (p, q) = lax.stop_gradient(near.axis), near.edges
+    corners = jnp.argmax(a.vert @ known), jnp.argmin(b.vert @ known)
+    own, others = (
+        jnp.where(
+            near.cross,
+            hull.of_edge[edge][jnp.minimum(jnp.arange(hull.around.shape[1]), 1)],
+            jnp.where(of_face, hull.of_face[near.face], hull.around[corner]),
+        )
+        for hull, edge, of_face, corner in zip(
+            (a, b), (p, q), (near.of_one, ~near.of_one), corners, strict=True
+        )
+    )
+    cosine = a.polygon_normal[own] @ b.polygon_normal[others].T
+    best = jnp.argmin(cosine)
+    i, j = own[best // len(others)], others[best % len(others)]
+    most = max(one.polygon.shape[1], other.polygon.shape[1])
+    faces = _corners(one, i, most), _corners(other, j, most)
+    normals = one.polygon_normal[i], other.polygon_normal[j]
+    points, dist = _face_on_face(*faces, *normals, 0.0)
+    chosen, new = _spanning(lax.stop_gradient(points), dist < APART, lax.stop_gradient(normals[0]))
+    points, dist = points[chosen], jnp.where(new, dist[chosen], APART)
+    # As in the C engine: from the point on the first polygon, along the normal of the second one
+    way = jnp.where(dist < APART, dist, 0.0)[:, None] * normals[0]
+    along = -normals[0] @ normals[1]
+    pos = points - way - 0.5 * (way @ normals[0])[:, None] * along * normals[1]
+    touch = jnp.where(dist < APART, along * dist, APART), pos, -normals[1]
+    # Only polygons that are nearly parallel touch as such
+    flat = (jnp.min(cosine) < -FLAT) & (jnp.min(lax.stop_gradient(dist)) < 0)
+    single = _either(
+        near.of_one,
+        _corner_on_face(one, near.face, near.axis, other, corners[1]),
+        _reversed(_corner_on_face(other, near.face, -near.axis, one, corners[0])),
+    )
+    crossing = _edges_on_face(one, p, other, q, _crossing(one, other, near, 4))
+    dist, pos, normal = _either(flat, touch, _either(near.cross, crossing, single))
+    return jnp.where(near.gap > 0, APART, dist), pos, normal
+
+
+def _corners(hull: Hull, polygon: Array, most: int | None = None) -> Array:
+    """Corners of a polygon (most, 3)."""
+    found = hull.vert[hull.polygon[polygon]]
+    return found if most is None else _padded(found, most)
+
+
+def _reversed(contacts: Contacts) -> Contacts:
+    dist, pos, normal = contacts
+    return dist, pos, -normal
+
+
+def _crossing(one: Hull, other: Hull, near: _Nearest, count: int) -> Contacts:
+    """The contact of two edges, as the first of `count`."""
+    (start, end), (begin, last) = (
+        hull.vert[hull.edge[e]] for hull, e in zip((one, other), near.edges, strict=True)
+    )
     ends = nearest_points(
         (start + end) / 2, (end - start) / 2, (begin + last) / 2, (last - begin) / 2
     )
-    depth, between = jnp.full_like(dist, APART), jnp.zeros_like(pos)
-    depth = depth.at[0].set(across @ (begin - start))
-    between = between.at[0].set(0.5 * (ends[0] + ends[1]))
-    if not boxes:
-        # Only faces that are nearly parallel touch as faces
-        parallel = -lax.stop_gradient(normals[0] @ normals[1]) > FLAT
-        flat = parallel & (jnp.min(lax.stop_gradient(dist)) < 0)
-        nearer &= ~flat
-        single = *_corner_on_face(one, faces[0], other, faces[1], axis, of_one), axis
-        dist, pos, normal = _either(flat, (dist, pos, normal), single)
-        depth, between, across = _edges_on_face(other, q, (start, end), (depth, between, across))
-    dist, pos, normal = _either(nearer, (depth, between, across), (dist, pos, normal))
-    apart = top > (reach if boxes else 0.0)
-    return jnp.where(apart, APART, dist), pos, normal
+    depth = near.across @ (begin - start)
+    dist = jnp.full(count, APART, depth.dtype).at[0].set(depth)
+    pos = jnp.zeros((count, 3), depth.dtype).at[0].set(0.5 * (ends[0] + ends[1]))
+    return dist, pos, near.across
 
 
 def _either(condition: Array, one: Contacts, other: Contacts) -> Contacts:
@@ -124,54 +196,33 @@ def _either(condition: Array, one: Contacts, other: Contacts) -> Contacts:
     return dist, pos, normal
 
 
-def _corner_on_face(
-    one: ConvexMesh, face: Array, other: ConvexMesh, facing: Array, axis: Array, of_one: Array
-) -> tuple[Array, Array]:
-    """Distances (4,) and positions (4, 3) where a face and a corner of the other polytope touch.
+def _corner_on_face(hull: Hull, face: Array, out: Array, other: Hull, corner: Array) -> Contacts:
+    """Contacts (4, ...) of a face with normal `out` and a corner of another polytope.
 
-    An edge that leads on from the corner almost along the face touches with its other end, too.
-
-    Args:
-        face, facing: corners of faces of one and of the other, (n, 3), with normals axis, -axis.
-        of_one: whether the face belongs to `one`.
+    An edge that leads on from the corner almost along the polygon of the face touches with both
+    ends, along the normal of the polygon.
     """
-
-    def touch(corners: Array, out: Array, hull: ConvexMesh) -> tuple[Array, Array]:
-        known, n = lax.stop_gradient((hull, out))
-        lowest = jnp.argmin(known.vert @ n)
-        at, beside = hull.vert[lowest], hull.edge == lowest
-        ways = known.vert[jnp.where(beside[:, 0], known.edge[:, 1], known.edge[:, 0])]
-        slopes = jnp.where(beside.any(axis=1), _slope(ways - known.vert[lowest], n), jnp.inf)
-        e = jnp.argmin(slopes)
-        end = hull.vert[jnp.where(beside[e, 0], hull.edge[e, 1], hull.edge[e, 0])]
-        depth = (at - corners[0]) @ out
-        alone = jnp.full(4, APART, depth.dtype).at[0].set(depth)
-        place = jnp.zeros((4, 3), depth.dtype).at[0].set(at - 0.5 * depth * out)
-        dist, pos = _edge_on_face(at, end, corners, out)
-        both = (slopes[e] < ALONG) & jnp.any(dist < APART)
-        return jnp.where(both, dist, alone), jnp.where(both, pos, place)
-
-    found = touch(face, axis, other), touch(facing, -axis, one)
-    dist, pos = (jnp.where(of_one, *pair) for pair in zip(*found, strict=True))
-    return dist, pos
+    polygon, at = hull.of_face[face], other.vert[corner]
+    depth = (at - hull.face[face, 0]) @ out
+    alone = jnp.full(4, APART, depth.dtype).at[0].set(depth)
+    place = jnp.zeros((4, 3), depth.dtype).at[0].set(at - 0.5 * depth * out)
+    normal, ends = hull.polygon_normal[polygon], other.vert[other.before[corner]]
+    slopes = _slope(lax.stop_gradient(ends - at), lax.stop_gradient(normal))
+    dist, pos = _edge_on_face(at, ends[jnp.argmin(slopes)], _corners(hull, polygon), normal)
+    both = (jnp.min(slopes) < ALONG) & jnp.any(dist < APART)
+    return _either(both, (dist, pos, normal), (alone, place, out))
 
 
-def _edges_on_face(
-    other: ConvexMesh, q: Array, edge: tuple[Array, Array], crossing: Contacts
-) -> Contacts:
-    """`crossing` of an edge with edge q of `other`, or contacts with a face beside it.
-
-    As in the C engine, those of an edge of the first polytope that is almost along the face.
-    """
-    start, end = edge
-    beside = other.edge_face_normal[q]
-    slopes = _slope(lax.stop_gradient(jnp.stack([end - start] * 2)), lax.stop_gradient(beside))
+def _edges_on_face(one: Hull, p: Array, other: Hull, q: Array, crossing: Contacts) -> Contacts:
+    """`crossing` of edges p and q, or contacts of p with a polygon beside q that it is along."""
+    start, end = one.vert[one.edge[p]]
+    polygons = other.of_edge[q]
+    normals = other.polygon_normal[polygons]
+    slopes = _slope(lax.stop_gradient(jnp.stack([end - start] * 2)), lax.stop_gradient(normals))
     f = jnp.argmin(slopes)
-    out = beside[f]
-    corners = other.face[jnp.argmax(lax.stop_gradient(other.face_normal @ out))]
-    dist, pos = _edge_on_face(start, end, corners, out)
+    dist, pos = _edge_on_face(start, end, _corners(other, polygons[f]), normals[f])
     along = (slopes[f] < ALONG) & jnp.any(dist < APART)
-    return _either(along, (dist, pos, -out), crossing)
+    return _either(along, (dist, pos, -normals[f]), crossing)
 
 
 def _slope(way: Array, normal: Array) -> Array:
@@ -229,6 +280,7 @@ def _part(start: Array, end: Array, corners: Array, out: Array) -> tuple[Array, 
         corners, out: of the face (n, 3), counterclockwise about its normal (3,).
     """
     sides = jnp.cross(corners - jnp.roll(corners, 1, axis=0), out)
+    sides = jnp.where(jnp.max(jnp.abs(sides), axis=1, keepdims=True) < SAME, 0.0, sides)
     left, rise = jnp.sum(sides * (corners - start), axis=1), sides @ (end - start)
     along, some = inner_part(left, rise)
     return start + along[:, None] * (end - start), some & jnp.any(start != end)
@@ -265,13 +317,14 @@ def _edge_on_face(start: Array, end: Array, corners: Array, out: Array) -> tuple
     return jnp.pad(dist, (0, 2), constant_values=APART), jnp.pad(pos, ((0, 2), (0, 0)))
 
 
-def moved(hull: ConvexMesh, centre: Array, turn: Array) -> ConvexMesh:
+def moved(hull: Hull, centre: Array, turn: Array) -> Hull:
     """A polytope in another frame, in which its own has this centre and these axes."""
     return hull.replace(
         vert=hull.vert @ turn.T + centre,
         face=hull.face @ turn.T + centre,
         face_normal=hull.face_normal @ turn.T,
         edge_face_normal=hull.edge_face_normal @ turn.T,
+        polygon_normal=hull.polygon_normal @ turn.T,
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from mjx_drax.physics.contacts import polytopes
-from mjx_drax.physics.contacts.collision import polytope
+from mjx_drax.physics.contacts.hull import polytope
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +37,7 @@ def test_contacts_of_hulls_are_as_deep_as_the_hulls_overlap():
             depths.append(-(planes[:, 3] - planes[:, :3] @ centres[-1]).max())
 
         def contacts(centre, turn):
-            return polytopes.contacts(polytopes.moved(one, centre, turn), other)
+            return polytopes.of_hulls(polytopes.moved(one, centre, turn), other)
 
         found = jax.jit(jax.vmap(contacts))(jnp.asarray(centres), jnp.asarray(turns))
         dist, _, normal = map(np.asarray, found)
@@ -51,7 +51,7 @@ def test_derivatives_of_contacts_take_little_memory():
 
     def depth(centre):
         placed = polytopes.moved(one, centre, jnp.eye(3))
-        return polytopes.contacts(placed, other)[0]
+        return polytopes.of_hulls(placed, other)[0]
 
     program = jax.jit(jax.jacfwd(depth)).lower(jnp.zeros(3)).compile()
     assert program.memory_analysis().temp_size_in_bytes < 5e6  # edges by edges it is gigabytes
