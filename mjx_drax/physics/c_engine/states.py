@@ -171,8 +171,8 @@ CONVERGED = {
 search for contacts of meshes at the least overlap.
 
 In nine models (humanoids, a dog, walkers, a pushed block) it took at most eleven iterations, and
-velocities were within 3e-13 of those after a thousand. Of hulls that overlap by 8 cm, 35 iterations,
-MuJoCo's default, found one contact where there are four."""
+velocities were within 3e-13 of those after a thousand. Of hulls that overlap by 8 cm, 35 iterations
+(the default) found one contact of four."""
 
 
 def converged(model: mujoco.MjModel) -> mujoco.MjModel:

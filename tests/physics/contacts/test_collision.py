@@ -207,7 +207,7 @@ def test_meshes_touch_boxes_and_meshes_as_in_the_c_engine(kind):
 
 
 def _bumpy(seed):
-    """Corners of a box whose sides are bent by 0.01 rad, and of a corner one that is there twice."""
+    """Corners of a box whose sides are bent by 0.01 rad; one corner is there twice."""
     at = np.array(list(itertools.product((-1, -0.4, 0.3, 1), repeat=3)))
     at = at[np.abs(at).max(axis=1) == 1]
     at = at / np.linalg.norm(at, axis=1, keepdims=True) ** 0.01
