@@ -259,9 +259,10 @@ class MPC:
                 "give the same ones for all, of shapes (nx,) and (nu,)."
             )
         require_plannable(problem)
-        self.original, self.problem = problem, holding(problem, hold)
-        look_again(self.problem)
-        self.solver = settled(self.problem, chains, seed, solver)
+        with problem.arithmetic():
+            self.original, self.problem = problem, holding(problem, hold)
+            look_again(self.problem)
+            self.solver = settled(self.problem, chains, seed, solver)
         metric = self.solver.flow.preconditioner
         if not metric.has_gains:
             raise DraxError(
@@ -319,11 +320,18 @@ class MPC:
             DraxError: x does not fit the problem, or is not finite; nor is t.
         """
         _require_time(t)
+        with self.problem.arithmetic():
+            return self._reset(x, t)
+
+    def _reset(self, x: ArrayLike, t: float) -> Plan:
         look_again(self.problem)
         problem = self.problem.with_x_init(self._inside(x)).at_time(t)
         self._begin(t)
         clock = time.perf_counter()
-        found = Search(Family.of_one(problem), self.chains, self.seed, self.solver).run()
+        search = Search(Family.of_one(problem), self.chains, self.seed, self.solver)
+        found = search.run()
+        if search.stage.place < len(search.stage.todo):
+            raise KeyboardInterrupt
         self._flow = found.flow
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
@@ -336,7 +344,7 @@ class MPC:
         self.planner = _planner(structure, self.explorers)
         self._like = _plan_like(carried.state)
         with rarely_collected():
-            self._apply(carried, x, t, 0.0)  # compiles
+            self._apply(carried, self._state(x), t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
         self._start = self._carried, self.latest
         self.statistics = Statistics()
@@ -366,7 +374,8 @@ class MPC:
         _require_time(t)
         by = max(0.0, (t - self._time) / float(self.problem.dynamics.dt))
         clock = time.perf_counter()
-        plan = self._apply(self._carried, x, t, by)
+        with self.problem.arithmetic():
+            plan = self._apply(self._carried, x, t, by)
         statistics = self.statistics
         statistics.latencies.append(time.perf_counter() - clock)
         statistics.failed += not plan.finite
@@ -464,11 +473,14 @@ class MPC:
 
     def _state(self, x: ArrayLike) -> np.ndarray:
         """A state as it was measured, (nx,) numbers that need not be finite."""
-        nx = self.problem.dynamics.given_nx
+        dynamics = self.problem.dynamics
+        nx = dynamics.given_nx
         try:
             state = numbers(x)
         except (TypeError, ValueError) as error:
             raise DraxError(f"the state x is {shown(x)}: give {nx} numbers.") from error
+        if state.shape == (dynamics.nx,):  # as x_init is: further states are the plan's own
+            state = state[:nx]
         if state.shape != (nx,):
             raise DraxError(f"the state x has shape {state.shape}: give {nx} numbers, ({nx},).")
         return state

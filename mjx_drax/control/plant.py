@@ -154,7 +154,7 @@ def _model_of(problem: Problem) -> mujoco.MjModel:
 def random_pushes(
     problem: Problem, count: int, size: float, over: tuple[float, float], seed: int
 ) -> list[Push]:
-    """Pushes on random moving bodies, along the world's x axis to either side.
+    """Pushes on random moving bodies, that have a name, along the world's x axis to either side.
 
     Args:
         problem, count, seed: of how many pushes on the model of which problem.
@@ -164,6 +164,9 @@ def random_pushes(
     model = _model_of(problem)
     random = np.random.default_rng(seed)
     movable = np.flatnonzero((model.body_weldid != 0) & (model.body_mass > 0.0))
+    movable = np.array([body for body in movable if model.body(body).name], int)
+    if not movable.size:
+        raise DraxError(f"{problem.name} has no moving body with a name: give one a name.")
     edges = np.linspace(*over, count + 1)
     pushes = []
     for begin, end in pairwise(edges):

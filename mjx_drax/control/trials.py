@@ -63,7 +63,7 @@ def simulate(
     realtime: bool = False,
     pushes: Sequence[Push] = (),
 ) -> Motion:
-    """Drive the plant for so many seconds, more than 0.
+    """Drive the plant for so many seconds from its time on, more than 0.
 
     Args:
         policy: that has been reset, or rewound, to the plant's time.
@@ -74,9 +74,10 @@ def simulate(
     """
     require_positive("duration", duration, "a positive number of seconds")
     times, states, controls, further = [plant.time], [plant.state], [], []
+    stop = plant.time + duration
     with Background(policy) if realtime else nullcontext(policy) as act:
         began = time.perf_counter() - plant.time
-        while plant.time < duration - 1e-9:
+        while plant.time < stop - 1e-9:
             u = act(plant.measured(), plant.time)
             plant.step(u)
             controls.append(u)

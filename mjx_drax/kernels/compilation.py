@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -47,6 +48,11 @@ _config: Any = jax.config
 """Its attributes say what holds in a context, too; `values` only what was set for the process."""
 
 
+_RARELY = threading.Lock()
+_rarely: list[tuple[int, int, int]] = []
+"""What the threshold was, once for each that is in `rarely_collected`."""
+
+
 @contextmanager
 def rarely_collected() -> Iterator[None]:
     """Let Python look for garbage a hundred times less often, also as a decorator.
@@ -54,12 +60,20 @@ def rarely_collected() -> Iterator[None]:
     While JAX traces, hardly any of its objects are garbage: to look for it took a fifth of the time
     until a quadruped's first iteration.
     """
-    before = gc.get_threshold()
-    gc.set_threshold(100 * before[0], *before[1:])
+    with _RARELY:
+        if not _rarely:
+            before = gc.get_threshold()
+            gc.set_threshold(100 * before[0], *before[1:])
+        else:
+            before = _rarely[0]
+        _rarely.append(before)
     try:
         yield
     finally:
-        gc.set_threshold(*before)
+        with _RARELY:  # the last one, of all threads, to leave
+            if len(_rarely) == 1:
+                gc.set_threshold(*before)
+            _rarely.pop()
 
 
 @rarely_collected()

@@ -95,7 +95,7 @@ def keyframes(
     poses: Sequence[Pose] = list(model.key_qpos) if names is None else list(names)
     if not len(poses):
         raise DraxError(f"{problem.name} has no keyframe to go through: add some, or name some.")
-    end = float(problem.times[-1])
+    end = float(_elapsed(problem)[-1])
     times = np.linspace(0, end, len(poses)) if len(poses) > 1 else [end]
     return waypoints(problem, zip(times, poses, strict=True))
 
@@ -124,7 +124,7 @@ def path(problem: Problem, qpos: ArrayLike, dt: float | None = None) -> Trajecto
     if not len(poses):
         raise DraxError(f"the path is empty: give positions of shape (T, {model.nq}).")
     if dt is None:
-        return _through(problem, np.linspace(0, float(problem.times[-1]), len(poses)), poses)
+        return _through(problem, np.linspace(0, float(_elapsed(problem)[-1]), len(poses)), poses)
     require_positive("dt of the path", dt, "a positive number of seconds")
     return _through(problem, dt * np.arange(len(poses)), poses)
 
@@ -237,9 +237,9 @@ def _qpos(model: mujoco.MjModel, pose: Any) -> np.ndarray:
 def _through(problem: Problem, times: np.ndarray, qpos: np.ndarray) -> Trajectory:
     """The trajectory along positions (T, nq) at rising times (T,)."""
     model, dt = _model(problem), float(problem.dynamics.dt)
-    q = np.array([interpolated(model, qpos, times, time) for time in problem.times])
+    q = np.array([interpolated(model, qpos, times, time) for time in _elapsed(problem)])
     v = np.array([between(model, *pair) for pair in itertools.pairwise(q)]) / dt
-    start = np.asarray(problem.x_init, float)
+    start = np.asarray(problem.x_init, float)[: problem.dynamics.given_nx]
     act = np.broadcast_to(start[model.nq + model.nv :], (problem.horizon, model.na))
     states = np.concatenate([start[None], np.concatenate([q[1:], v, act], axis=1)])
     u = inverse_dynamics(model, states, dt, middle_control(problem.bounds))
@@ -247,6 +247,11 @@ def _through(problem: Problem, times: np.ndarray, qpos: np.ndarray) -> Trajector
 
 
 def _bounded(problem: Problem, x: np.ndarray, u: np.ndarray) -> Trajectory:
-    knots = Trajectory(jnp.asarray(x), jnp.asarray(u))
-    lower, upper = problem.bounds.sides(knots)
-    return Trajectory(jnp.clip(knots.x, lower.x, upper.x), jnp.clip(knots.u, lower.u, upper.u))
+    box, nx = problem.bounds, x.shape[-1]  # without further states
+    lower, upper = box.x_lower[..., :nx], box.x_upper[..., :nx]
+    return Trajectory(jnp.clip(x, lower, upper), jnp.clip(u, box.u_lower, box.u_upper))
+
+
+def _elapsed(problem: Problem) -> np.ndarray:
+    """Times of x_0..x_K since x_0 (K + 1,) [s]."""
+    return np.asarray(problem.times, float) - float(problem.t_init)

@@ -56,7 +56,9 @@ def dark_pixels(picture: str | Path | ArrayLike, threshold: float) -> np.ndarray
 
         try:
             with Image.open(picture) as opened:
-                picture = np.asarray(opened.convert("L"))
+                deep = opened.mode.startswith("I")  # 16 bits, which "L" would cut off at 255
+                picture = np.asarray(opened if deep else opened.convert("L"))
+                picture = picture.astype(np.uint16) if deep else picture
         except (OSError, ValueError) as error:
             raise DraxError(
                 f"the image {shown(str(picture))} cannot be read: give a file such as map.png."
@@ -65,7 +67,8 @@ def dark_pixels(picture: str | Path | ArrayLike, threshold: float) -> np.ndarray
         pixels = np.asarray(picture)
         if pixels.dtype == bool:
             return pixels
-        white = 255.0 if pixels.dtype.kind in "iu" else 1.0
+        deep = pixels.dtype == np.uint16
+        white = 65535.0 if deep else 255.0 if pixels.dtype.kind in "iu" else 1.0
         return numbers(pixels) < threshold * white
     except (TypeError, ValueError) as error:
         raise DraxError(f"the image is {shown(picture)}: give a file, or numbers.") from error

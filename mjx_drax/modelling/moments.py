@@ -37,7 +37,6 @@ class Windowed:
     end: Array
     idle: Array
     takes_knot = True
-    slop = ROUNDING
 
     def __call__(self, *arguments: Any, knot: Knot) -> Array:
         """The function's value, or `idle` for each of its entries."""
@@ -45,16 +44,19 @@ class Windowed:
 
     def active(self, knot: Knot) -> Array:
         """Whether the function counts at a knot."""
-        slop = self.slop * knot.dt
-        return (knot.time >= self.begin - slop) & (knot.time <= self.end + slop)
+        return self.holds(knot.time, knot.dt)
+
+    def holds(self, time: Any, dt: Any) -> Array:
+        """Whether the window, with control steps of dt about it, holds a time [s]."""
+        slop = ROUNDING * dt
+        return (time >= self.begin - slop) & (time <= self.end + slop)
 
     def check_knots(self, label: str, times: np.ndarray) -> None:
         """Complain about a window without a knot, where x_0..x_K are at `times` [s]."""
         at_end = label.startswith("terminal")
         own, step = times[-1:] if at_end else times[:-1], times[1] - times[0]
         begin, end = float(self.begin), float(self.end)
-        slop = self.slop * step
-        if not ((own >= begin - slop) & (own <= end + slop)).any():
+        if not self.holds(own, step).any():
             last = "" if at_end else "; for x_K there are the terminal functions"
             window = f"at {begin:g} s" if begin == end else f"from {begin:g} to {end:g} s"
             raise DraxError(
@@ -68,12 +70,10 @@ class Windowed:
 class AtTime(Windowed):
     """The same at the one knot that is nearest to `begin` = `end`."""
 
-    slop = 0.5
-
-    def active(self, knot: Knot) -> Array:
-        """Whether the function counts at a knot."""
-        off = (knot.time - self.begin) / knot.dt
-        return (off >= -self.slop) & (off < self.slop)
+    def holds(self, time: Any, dt: Any) -> Array:
+        """Whether the knot at a time is the nearest; halfway between two it is the first."""
+        off = (time - self.begin) / dt + ROUNDING  # float32 cannot tell which is nearer
+        return (off >= -0.5) & (off < 0.5)
 
 
 def at_time(function: Callable[..., Any], time: ArrayLike, *, idle: float = 0.0) -> Windowed:

@@ -49,10 +49,10 @@ class Reference:
     values: Any
 
     def at(self, knot: Knot) -> Array:
-        """The target at one knot, (n,); the last row behind the end."""
+        """The target at one knot, (n,); the last row behind the end, the first before it."""
         if isinstance(self.values, Partial):
             return jnp.asarray(self.values(knot.time))
-        row: Array = self.values[jnp.minimum(knot.index, len(self.values) - 1)]
+        row: Array = self.values[jnp.clip(knot.index, 0, len(self.values) - 1)]
         return row
 
     def check_knots(self, label: str, times: np.ndarray) -> None:

@@ -142,6 +142,7 @@ class MjxDynamics(Dynamics):
         free_step: whether the timestep is that of the knot, over `substeps`.
         numbers: numbers(model, parameters) -> {field: array}, of the model, from the parameters of
             the knot; or None.
+        free: fields of the model that `numbers` gives, of which `structure` knows nothing.
         time: of the knot that `at` has bound this to [s]; None if it has not.
     """
 
@@ -154,13 +155,14 @@ class MjxDynamics(Dynamics):
     structure: Structure = field(init=False)
     free_step: bool = False
     numbers: Callable[[mjx.Model, Any], Any] | None = None
+    free: tuple[str, ...] = ()
     time: Array | None = field(default=None, init=False)
     checked = True
     twice = False
 
     def __post_init__(self) -> None:
         """A model that replaces another one, as by `dataclasses.replace`, has its own structure."""
-        object.__setattr__(self, "structure", Structure.of(self.model))
+        object.__setattr__(self, "structure", Structure.of(self.model, frozenset(self.free)))
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {model_name(self.mj_model)}>"
@@ -240,9 +242,7 @@ class MjxDynamics(Dynamics):
         self, free_step: bool, numbers: Callable[[mjx.Model, Any], Any] | None, names: Iterable[str]
     ) -> MjxDynamics:
         """The same, with the step or the numbers of the fields `names` given by the knot."""
-        new = replace(self, free_step=free_step, numbers=numbers)
-        object.__setattr__(new, "structure", Structure.of(self.model, frozenset(names)))
-        return new
+        return replace(self, free_step=free_step, numbers=numbers, free=tuple(sorted(names)))
 
     def observe(self, x: Array, u: Array) -> Observed:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
@@ -397,7 +397,7 @@ class MjxDynamics(Dynamics):
 
 
 _TRACED = ("dt", "derivatives", "time")
-_STATIC = ("substeps", "structure", "free_step", "numbers")
+_STATIC = ("substeps", "structure", "free_step", "numbers", "free")
 
 
 def _flatten(dynamics: MjxDynamics) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

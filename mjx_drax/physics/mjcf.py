@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -158,6 +159,8 @@ def from_mjcf(
     if derivatives is not None:
         require_part("derivatives", derivatives, "jacobian", "Smoothed()")
     mj_model = load(model, actuators)
+    if mj_model is model:  # which the user may change later, for the next problem
+        mj_model = copy.deepcopy(model)
     name = model_name(mj_model) if name is None else name
     require_name(name)
     substeps = steps_between_knots(mj_model, dt)

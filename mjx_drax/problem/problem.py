@@ -354,15 +354,23 @@ class Problem:
     def started(self, knots: Trajectory) -> Trajectory:
         """Given knots as states of the dynamics, with the x_0 next to x_init where it is free.
 
-        Further states of the dynamics may be missing.
+        Further states of the dynamics may be missing. Those that stay as they are, such as the step
+        of a free duration, are in x_0 what they are in x_1.
         """
         short = self.dynamics.nx - knots.x.shape[-1]
         pad = [(0, 0)] * (knots.x.ndim - 1)
         knots = replace(knots, x=self.dynamics.valid(jnp.pad(knots.x, [*pad, (0, short)])))
         if self.free and knots.start is None:
-            nearest = jnp.clip(0.0, self.bounds.start_lower, self.bounds.start_upper)
-            shape = (*knots.x.shape[:-2], len(self.free))
-            knots = replace(knots, start=jnp.broadcast_to(nearest, shape))
+            away = jnp.zeros((*knots.x.shape[:-2], len(self.free)), knots.x.dtype)
+            given = self.dynamics.given_nx
+            own = self.dynamics.ndx - (self.dynamics.nx - given)
+            for i, places in enumerate(self.free):
+                column = given + max(places) - own
+                if not short and column >= given:
+                    first = knots.x[..., 0, column] - self.x_init[column]
+                    away = away.at[..., i].set(first)
+            start = jnp.clip(away, self.bounds.start_lower, self.bounds.start_upper)
+            knots = replace(knots, start=start)
         return self.dynamics.consistent(knots) if short else knots
 
     def rolled_out(self, knots: Trajectory, gains: Array) -> tuple[Array, Array]:
@@ -449,12 +457,12 @@ class Problem:
                 f"goal failed at x = {shown(x.tolist())}: {reason(error)}. Make it a function of "
                 "the state of a function problem, or of the mujoco.MjData of a model."
             ) from error
-        if reached.size != 1 or reached.dtype.kind not in "biuf":
+        if reached.size != 1 or reached.dtype.kind != "b":
             raise DraxError(
                 f"goal returned shape {reached.shape}, {shown(reached)}: it must return one truth "
-                "value."
+                "value, as abs(x[0] - 3.0) < 0.05 is."
             )
-        return bool(reached.item() == reached.item() and reached.item())  # NaN is not reached
+        return bool(reached.item())
 
     def in_float64(self) -> Problem:
         """The same problem in float64, as `solve(..., precision=64)` makes it.
@@ -498,8 +506,9 @@ class Problem:
         """
         if self.dynamics.phases:
             require_rows(data)
-        found = data_rows(data, self.times)
-        return checked(replace(self, data=found, data_at=data if callable(data) else None))
+        with self.arithmetic():
+            found = data_rows(data, self.times)
+            return checked(replace(self, data=found, data_at=data if callable(data) else None))
 
     def at_time(self, t_init: float) -> Problem:
         """The same problem with x_0 at another time [s].
@@ -508,23 +517,25 @@ class Problem:
         at their last row behind their end.
         """
         by = (t_init - float(self.t_init)) / float(self.dynamics.dt)
-        moved = replace(self, t_init=jnp.asarray(t_init, self.x_init.dtype))
-        if self.data is None:
-            return moved
-        if self.data_at is not None:
-            return replace(moved, data=data_rows(self.data_at, moved.times))
-        return replace(moved, data=later(self.data, round(by)))
+        with self.arithmetic():
+            moved = replace(self, t_init=jnp.asarray(t_init, self.x_init.dtype))
+            if self.data is None:
+                return moved
+            if self.data_at is not None:
+                return replace(moved, data=data_rows(self.data_at, moved.times))
+            return replace(moved, data=later(self.data, round(by)))
 
     def with_x_init(self, x_init: ArrayLike) -> Problem:
-        """The same problem from another initial state (nx,).
+        """The same problem from another initial state (nx,); bounds of a free x_0 move along.
 
         Raises:
             DraxError: it does not fit.
         """
-        x = vector("x_init", x_init)
-        if len(x) == self.dynamics.given_nx:
-            x = jnp.concatenate([x, self.x_init[len(x) :]])
-        return checked(replace(self, x_init=x))
+        with self.arithmetic():
+            x = vector("x_init", x_init)
+            if len(x) == self.dynamics.given_nx:
+                x = jnp.concatenate([x, self.x_init[len(x) :]])
+            return checked(replace(self, x_init=x))
 
 
 def checked(problem: Problem) -> Problem:
@@ -549,10 +560,11 @@ def checked(problem: Problem) -> Problem:
     costs = (problem.running, problem.terminal)
     if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
         raise DraxError(f"{name} has no cost: give a running or a terminal one.")
-    for label, function, arguments, shape in functions_of(problem):
-        if label != STEP or not dynamics.checked:  # tracing MJX takes a second
-            require_shape(label, function, arguments, shape)
-    _check_guess(problem)
+    with problem.arithmetic():
+        for label, function, arguments, shape in functions_of(problem):
+            if label != STEP or not dynamics.checked:  # tracing MJX takes a second
+                require_shape(label, function, arguments, shape)
+        _check_guess(problem)
     problem.reached(np.asarray(problem.x_init, float))
     return problem
 

@@ -167,7 +167,8 @@ def finished(kept: Chains, now: Chains) -> Chains:
     """
     rows = slice(len(kept.missed))
     cost, sound = now.cost[rows], now.sound[rows]
-    worse = np.where(sound, cost > kept.cost + CHEAPER * np.abs(kept.cost), kept.sound)
+    dearer = cost > kept.cost + CHEAPER * np.abs(kept.cost)
+    worse = kept.sound & (dearer | ~sound)
     source = np.arange(len(worse)) + len(worse) * ~worse
     state, info = gather((kept.state, kept.info), (now.state, now.info), source)
     since = np.where(worse, kept.feasible_since, now.feasible_since[rows])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.base.errors import DraxError, reason, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, reason, shown
 from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Scale
@@ -54,11 +55,13 @@ class Family:
         problem: all of them; leaves that differ have a leading axis (N, ...).
         differs: which leaves, in the order of `jax.tree.leaves`.
         count: N.
+        nth: makes one of them by itself, if they differ in more than numbers, as in their goals.
     """
 
     problem: Problem
     differs: tuple[bool, ...]
     count: int
+    nth: Callable[[int], Problem] | None = None
 
     @cached_property
     def kinked(self) -> bool:
@@ -139,7 +142,13 @@ class Family:
         stacked = iter(differing(values))
         merged = [next(stacked) if d else a for a, d in zip(leaves, differs, strict=True)]
         whole = with_host_fields(jax.tree.unflatten(tree[0], merged), first)
-        family = cls(whole, differs, count)
+        if first.guess is not last.guess:
+            raise DraxError(
+                "make gives every problem another guess, and all start from one: leave guess out, "
+                "or make it outside of make."
+            )
+        alike = first.goal is last.goal and first.data_at is last.data_at
+        family = cls(whole, differs, count, None if alike else nth)
         if family.varies("dynamics") and first.dynamics.fingerprint():
             raise DraxError(
                 f"make changes the dynamics of {first.name}, and the C engine would "
@@ -182,7 +191,8 @@ class Family:
         """One of the problems."""
         if self.alone:
             return self.problem
-        return self._changed(lambda leaf: leaf[i])
+        found = self._changed(lambda leaf: leaf[i])
+        return with_host_fields(found, self.nth(i)) if self.nth else found
 
     def rows(self, indices: np.ndarray, chains: int) -> Problem:
         """Those problems, with a row for each of their chains in the leaves that differ."""
@@ -296,9 +306,13 @@ class Family:
         def asked(problem: Problem, motions: np.ndarray) -> np.ndarray:
             times, begin = problem.dynamics.times, float(problem.t_init)
             ends = [float(times(motion, begin)[-1]) for motion in motions]
-            return problem.all_reached(motions[:, -1], ends)
+            try:
+                return problem.all_reached(motions[:, -1], ends)
+            except DraxError as error:  # a function of the user's, after all that was computed
+                warnings.warn(f"{error} No motion counts as there.", DraxWarning, stacklevel=2)
+                return np.zeros(len(motions), bool)
 
-        if self.alone or not self.varies("dynamics", "t_init"):
+        if self.alone or not (self.nth or self.varies("dynamics", "t_init")):
             return asked(self.at(0), states)
         found = np.zeros(len(states), bool)
         for i in np.unique(of):

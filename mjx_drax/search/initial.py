@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,14 +48,27 @@ def initial_knots(
         if not np.isfinite(array).all():
             raise DraxError(f"guess.{label} holds NaN or infinite values: give finite knots.")
         knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
-    start = (
-        None
-        if guess.start is None
-        else jnp.broadcast_to(
-            jnp.asarray(guess.start, problem.x_init.dtype), (chains, len(problem.free))
-        )
-    )
+    start = _start(problem, guess.start, chains)
     return problem.started(Trajectory(knots[0], knots[1], start=start))
+
+
+def _start(problem: Problem, given: Any, chains: int) -> Array | None:
+    """`Trajectory.start` of a guess for every chain, (chains, n0); None if it has none."""
+    n0 = len(problem.free)
+    if given is None or not n0:  # as of the answer to a problem whose x_0 was free
+        return None
+    try:
+        start = np.asarray(numbers(given), problem.x_init.dtype)
+    except (TypeError, ValueError) as error:
+        raise DraxError(
+            f"guess.start is {shown(given)}: give numbers of shape ({n0},), or leave it out."
+        ) from error
+    if start.shape not in ((n0,), (chains, n0)) or not np.isfinite(start).all():
+        raise DraxError(
+            f"guess.start is {shown(given)}, of shape {start.shape}: give {n0} finite numbers, or "
+            f"({chains}, {n0}), or leave it out."
+        )
+    return jnp.asarray(np.broadcast_to(start, (chains, n0)))
 
 
 _draw = jax.jit(jax.vmap(Problem.draw, in_axes=(None, 0)))

@@ -211,7 +211,7 @@ def solve_batch(
         values: arrays, or a pytree of them, with one entry for each problem along the first axis.
         chains: for each problem.
         seed: of all random numbers; problem i gets the same ones whatever is solved beside it.
-        solver: `Restarts()` by default.
+        solver: `Restarts()` by default; a metric without gains has no feedback here.
         chunk: problems that are solved at a time; None: as many as half of the free memory holds.
             With 2,048 chains in it and more, the last ones that move go on in a smaller program,
             which compiles beside the large one.

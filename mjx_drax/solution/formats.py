@@ -108,7 +108,8 @@ def _keys(solution: Solution, model: mujoco.MjModel) -> Iterator[str]:
     for k, (time, x) in enumerate(zip(solution.times, states, strict=True)):
         if not np.isfinite(x).all():
             break
-        parts = dict(zip(("qpos", "qvel", "act"), np.split(x, ends), strict=True))
+        own = x[: ends[1] + model.na]  # without further states
+        parts = dict(zip(("qpos", "qvel", "act"), np.split(own, ends), strict=True))
         parts["ctrl"] = controls[min(k, len(controls) - 1)]
         numbers = "".join(f" {n}={quoteattr(_numbers(v))}" for n, v in parts.items() if v.size)
         yield f'    <key name="replay_{k}" time="{time:.9g}"{numbers}/>'

@@ -239,7 +239,8 @@ class Results:
         costs = np.nan_to_num(self.replay_cost, nan=np.inf)
         for eligible in (self.certified_chains, self.feasible):
             if eligible.any():
-                return int(np.argmin(np.where(eligible, costs, np.inf)))
+                of = np.flatnonzero(eligible)  # whose costs may all be infinite
+                return int(of[np.argmin(costs[of])])
         return int(np.argmin(np.nan_to_num(self.max_defect, nan=np.inf)))
 
     def chain_or_best(self, chain: int | None) -> int:

@@ -530,4 +530,4 @@ def worst_knots(
             if a == a  # NaN is not equal to itself
         ]
         if column:
-            yield max(column, key=lambda v: v.ratio)
+            yield max(column, key=lambda v: v.ratio if v.size else 0.0)  # 0 of 0 is no ratio

@@ -112,6 +112,7 @@ def run(
         suite: one of `SUITES`; by default tasks with their own settings.
         report: called with every row as it is ready.
     """
+    names = [tasks.full_name(name) for name in names]
     check(names, suite)
     keep_none()
     measured, known = SUITES[suite] if suite else (_tasks, tasks.names)

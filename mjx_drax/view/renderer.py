@@ -78,10 +78,32 @@ class _OpenGLRenderer:
         if self._sky is None:
             mujoco.mjr_readPixels(frame, None, self._rect, self._mjr)
             return frame[::-1]  # OpenGL counts rows from below
-        depth = np.empty((self._rect.height, self._rect.width), np.float32)
+        empty = self._read(frame)
+        found = np.where(empty, self._sky, frame[::-1])
+        clear = [geom for geom in scene.geoms[: scene.ngeom] if 0.0 < geom.rgba[3] < 1.0]
+        if not clear:
+            return found
+        # What is translucent leaves no depth: where it is in front of nothing, its share of the
+        # colour is that of the same picture with all of it opaque
+        alpha = [float(geom.rgba[3]) for geom in clear]
+        for geom in clear:
+            geom.rgba[3] = 1.0
+        mujoco.mjr_render(self._rect, scene, self._mjr)
+        solid = np.empty_like(frame)
+        glass = empty & ~self._read(solid)
+        for geom, before in zip(clear, alpha, strict=True):
+            geom.rgba[3] = before
+        seen, whole = (a[::-1].sum(axis=2, keepdims=True, dtype=float) for a in (frame, solid))
+        share = np.clip(seen / np.maximum(whole, 1.0), 0.0, 1.0)
+        mixed = np.clip(frame[::-1] + (1.0 - share) * self._sky, 0.0, 255.0).astype(np.uint8)
+        return np.where(glass, mixed, found)
+
+    def _read(self, frame: Frame) -> np.ndarray:
+        """Read the picture, rows from below; where nothing is, (h, w, 1), rows from above."""
+        depth = np.empty(frame.shape[:2], np.float32)
         mujoco.mjr_readPixels(frame, depth, self._rect, self._mjr)
         empty = (depth <= 0.0) | (depth >= 1.0)  # MuJoCo may turn the direction of depths
-        return np.where(empty[::-1, :, None], self._sky, frame[::-1])
+        return empty[::-1, :, None]
 
     def close(self) -> None:
         self._gl.make_current()

@@ -4,9 +4,11 @@ import copy
 import json
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from builders import double_integrator, robot
@@ -144,6 +146,15 @@ def test_float64_stays_float64():
         }
         weight = policy.problem.running.residual.args[0].args[-1]
         assert weight == np.sqrt(DT)  # of `hold`, to the last bit
+
+
+def test_a_problem_in_float64_is_planned_for_in_float64():
+    policy = MPC(balance().in_float64(), chains=2, explorers=1, hold=1.0, solver=FAST)
+    x = np.array([0.5, 0.0])
+    for k in range(3):
+        x = stepped(x, policy(x, k * DT))
+    assert policy.statistics.failed == 0
+    assert policy.latest.x.dtype == np.float64
 
 
 def test_a_shift_by_one_knot_moves_all_that_is_carried():
@@ -310,6 +321,28 @@ def test_random_pushes_are_spread_over_time(slider):
     pushes = random_pushes(slider, 3, 2.0, (1.0, 4.0), seed=5)
     assert [1 <= p.time - i <= 2 for i, p in enumerate(pushes)] == [True] * 3
     assert {abs(p.force[0]) for p in pushes} == {20.0}  # 2 m/s for 1 kg in 0.1 s
+
+
+def test_random_pushes_are_on_bodies_with_names(slider):
+    unnamed = mujoco.MjModel.from_xml_string(SLIDER.replace('name="cart"', ""))
+    problem = replace(slider, dynamics=replace(slider.dynamics, mj_model=unnamed))
+    with pytest.raises(DraxError, match="no moving body with a name"):
+        random_pushes(problem, 1, 2.0, (0.0, 1.0), 0)
+
+
+def test_a_second_run_goes_on_where_the_first_ended(slider):
+    plant, policy = Plant(slider), MPC(slider, chains=2, explorers=0, every=10**6, solver=FAST)
+    policy.reset(slider.x_init)
+    assert len(loop.simulate(policy, plant, 0.1).controls) == 10
+    assert len(loop.simulate(policy, plant, 0.1).controls) == 10
+
+
+def test_ctrl_c_in_the_first_solve_ends_the_program(slider, monkeypatch):
+    policy = MPC(slider, chains=2, explorers=0, solver=FAST)
+    stopped = SimpleNamespace(run=lambda: None, stage=SimpleNamespace(place=0, todo=[0]))
+    monkeypatch.setattr(mpc, "Search", lambda *_: stopped)
+    with pytest.raises(KeyboardInterrupt):
+        policy.reset(slider.x_init)
 
 
 def test_pushes_and_plant_have_the_model_of_a_problem_with_rates():

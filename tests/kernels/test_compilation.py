@@ -79,6 +79,13 @@ def test_garbage_is_looked_for_less_often_for_a_while():
         fails()
     assert seen == [100 * usual[0]]
     assert gc.get_threshold() == usual
+    one, other = compilation.rarely_collected(), compilation.rarely_collected()
+    one.__enter__()  # as two threads may
+    other.__enter__()
+    one.__exit__(None, None, None)
+    assert gc.get_threshold()[0] == 100 * usual[0]
+    other.__exit__(None, None, None)
+    assert gc.get_threshold() == usual
 
 
 def test_there_are_no_options_where_jax_is_told_to_hurry():

@@ -230,3 +230,20 @@ def test_without_a_model_there_is_a_still_guess_and_its_spread():
 def test_mistakes_are_named(make, says):
     with pytest.raises(DraxError, match=says):
         make()
+
+
+def test_times_of_guesses_are_counted_from_x_0():
+    later = PROBLEM.at_time(5.0)
+    for guess in (
+        lambda problem: guesses.waypoints(problem, [(0.15, HIGH), (0.1, "back")]),
+        guesses.keyframes,
+        lambda problem: guesses.path(problem, np.linspace(LOW, HIGH, 7)),
+    ):
+        close(positions(guess(later)), positions(guess(PROBLEM)))
+
+
+def test_models_with_further_states_have_guesses_of_their_own():
+    problem = arm(running_residual=lambda data, u, knot: knot.rate, rates=1)
+    guess = guesses.waypoints(problem, [(0.1, "back")])
+    assert guess.x.shape[-1] == problem.dynamics.given_nx < problem.dynamics.nx
+    assert initial_knots(problem, 2, guess, None).x.shape[-1] == problem.dynamics.nx

@@ -200,7 +200,10 @@ def test_images_are_upright_and_near_the_true_distance(tmp_path):
     p = np.random.default_rng(0).uniform([1.05, 2.05], [3.95, 3.95], (2000, 2))
     pixels = np.where(dark, 20, 250).astype(np.uint8)
     Image.fromarray(pixels).save(tmp_path / "map.png")
-    for picture in (dark, pixels, pixels / 255, tmp_path / "map.png", str(tmp_path / "map.png")):
+    deep = pixels.astype(np.uint16) * 257
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    files = tmp_path / "map.png", str(tmp_path / "map.png"), tmp_path / "deep.png"
+    for picture in (dark, pixels, deep, pixels / 255, *files):
         found = obstacles.image(picture, 0.1, [1, 2])
         error = np.abs(found(p) - true(p))
         assert error.max() < 0.025

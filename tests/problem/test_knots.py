@@ -22,6 +22,8 @@ from mjx_drax import (
     solve,
     solve_batch,
 )
+from mjx_drax.modelling.terms import Reference
+from mjx_drax.problem.trajectory import Knot
 
 TIMES = DT * np.arange(K + 1)
 
@@ -242,3 +244,30 @@ def test_references_of_the_wrong_length_are_named():
             robot(running_residual=residual)
     with pytest.raises(DraxError, match=r"posture returned shape \(2,\)"):
         terms.posture(lambda t: jnp.zeros(2))
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.02, 0.01, 0.003])
+def test_a_time_between_two_knots_is_that_of_one(dt):
+    """In float32 no time is exactly halfway between two others."""
+    knots = 200
+    times = jnp.asarray(dt, jnp.float32) * jnp.arange(knots, dtype=jnp.float32)
+    for k in range(knots - 1):
+        way = at_time(lambda x, u: x, (k + 0.5) * dt)
+        active = np.asarray(way.active(Knot(index=0, stage=0, time=times, dt=jnp.float32(dt))))
+        assert np.flatnonzero(active).tolist() == [k]
+        way.check_knots("equality", np.arange(knots) * dt)
+
+
+def test_another_start_or_time_stays_in_float64():
+    problem = double_integrator(running_residual=off_track, data=lambda t: {"p": jnp.sin(t)})
+    double = problem.in_float64()
+    for moved in (double.with_x_init([0.1, 0.2]), double.at_time(1.0)):
+        assert moved.precision == 64
+        assert np.asarray(moved.bounds.u_lower).dtype == np.float64
+    assert double.at_time(1.0).data["p"].dtype == np.float64
+
+
+def test_a_reference_before_its_first_row_is_that_row():
+    reference = Reference(jnp.arange(5.0)[:, None])
+    rows = [float(reference.at(Knot(index=i, stage=i, time=0.0, dt=0.1))[0]) for i in (-2, 1, 9)]
+    assert rows == [0.0, 1.0, 4.0]

@@ -8,6 +8,8 @@ import pytest
 from jax.tree_util import Partial
 
 from mjx_drax import DraxError, Langevin, Polish, Restarts, from_function, from_mjcf, solve_batch
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search import engine
 from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
@@ -283,3 +285,23 @@ def test_goals_are_asked_at_the_times_of_their_own_problems():
         patch.setattr(type(BASE), "all_reached", remember)
         family.reached(of, np.zeros((4, 11, 2)))
     assert sorted(asked) == pytest.approx([1.0, 2.0, 3.0, 3.0])
+
+
+def test_every_problem_has_its_own_goal():
+    def make(t):
+        near = replace(BASE, goal=lambda x, t=t: bool(abs(float(x[0]) - float(t)) < 0.1))
+        return replace(near, t_init=t)
+
+    family = Family.of(make, jnp.asarray([0.0, 1.0, 2.0]))
+    ends = np.zeros((3, 11, 2))
+    ends[:, -1, 0] = 1.0
+    assert family.reached(np.array([0, 1, 2]), ends).tolist() == [False, True, False]
+    still = Trajectory(jnp.zeros((10, 2)), jnp.zeros((10, 1)))
+    with pytest.raises(DraxError, match="every problem another guess"):
+        Family.of(lambda t: replace(BASE, t_init=t, guess=lambda key: still), jnp.arange(2.0))
+
+
+def test_a_goal_that_fails_at_the_end_loses_nothing():
+    family = Family.of_one(replace(BASE, goal=lambda x: x[7] > 0))
+    with pytest.warns(DraxWarning, match="goal failed .* No motion counts as there"):
+        assert not family.reached(np.zeros(2, int), np.zeros((2, 11, 2))).any()

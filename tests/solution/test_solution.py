@@ -546,6 +546,9 @@ def test_without_a_certificate_the_best_is_the_feasible_chain_with_the_cheapest_
     replays = replace(made.open_loop, cost=costs, success=np.zeros(4, bool))
     plans = {"cost": np.array([1.0, 1.9, 2.5, 0.1]), "max_defect": np.array([0.0, 0.0, 0.0, 1.0])}
     assert replace(made, open_loop=replays, feedback=replays, **plans).best_chain == 2
+    replays = replace(replays, cost=np.array([0.1, np.inf, np.nan, np.inf]))
+    plans["max_defect"] = np.array([1.0, 0.0, 0.0, 0.0])
+    assert replace(made, open_loop=replays, feedback=replays, **plans).best_chain == 1
 
 
 @pytest.mark.slow

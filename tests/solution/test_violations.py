@@ -27,7 +27,13 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.program import from_program
 from mjx_drax.solution.replay import open_loop_is_better, replays
 from mjx_drax.solution.report import lines
-from mjx_drax.solution.violations import KINDS, Violation, most_broken, warn_of_loose_ends
+from mjx_drax.solution.violations import (
+    KINDS,
+    Violation,
+    most_broken,
+    warn_of_loose_ends,
+    worst_knots,
+)
 from mjx_drax.view import plotting
 from mjx_drax.view.video import outcome_lines
 
@@ -403,6 +409,11 @@ def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, 
         warn_of_loose_ends(*given)
     told = [f"off the terminal equality by {place:.1e}" in str(w.message) for w in found]
     assert told == [True] * warned
+
+
+def test_of_violations_without_a_tolerance_the_largest_is_told():
+    sizes, allowed = np.array([[0.0], [0.5], [2.0]]), np.zeros((3, 1))
+    assert next(worst_knots("state_bounds", sizes, allowed, 0)).size in (0.5, 2.0)
 
 
 def test_the_worst_of_a_plan_is_relative_to_what_plans_may_break():

@@ -162,6 +162,8 @@ def test_suites_name_what_they_have():
         benchmark.run(suite="everything")
     with pytest.raises(DraxError, match="deep_trap"):
         benchmark.run(["pendulum_swingup"], suite="gpu")
+    with pytest.raises(DraxError, match="gpu has no pendulum_swingup"):
+        benchmark.run(["pendulum_s"], suite="gpu")
 
 
 def test_evaluations_count_linearizations_and_the_ladder():

@@ -102,6 +102,24 @@ def test_frames_have_the_asked_shape(backend: str) -> None:
         np.testing.assert_array_equal(held, frames[5])
 
 
+def test_what_is_translucent_is_seen_in_front_of_nothing(backend: str) -> None:
+    ball = '<body pos="{} 0 0"><joint/><geom size="0.2" rgba="1 0 0 {}"/></body>'
+    xml = "<mujoco><worldbody>{}</worldbody></mujoco>"
+    seen = [
+        video.render_frames(
+            mujoco.MjModel.from_xml_string(xml.format(ball.format(0, alpha) + ball.format(1, 1))),
+            [[0.0, 0.0]], [0.0], fps=1, size=(WIDTH, HEIGHT),
+        )[0].astype(float)
+        for alpha in (0.0, 0.5, 1.0)
+    ]  # fmt: skip
+    clear, half, solid = seen
+    there = np.abs(solid - clear).max(axis=2) > 40
+    assert there.sum() > 50
+    share = ((clear - half) / np.maximum(clear - solid, 1.0))[there][:, 1]  # of green, the sky's
+    assert share.min() > 0.4
+    assert np.median(share) < 0.85  # OpenGL draws its front and its back: 1 - 0.5^2
+
+
 @pytest.mark.parametrize(
     ("name", "right", "up"),
     [
