@@ -258,7 +258,7 @@ def _not_collided(model: mujoco.MjModel, without: set[Pair]) -> str:
 OTHER_CONTACTS = {
     tuple(int(getattr(_GEOM, f"mjGEOM_{kind}")) for kind in pair.split())
     for pair in (
-        *("PLANE MESH", "CAPSULE MESH", "BOX MESH", "MESH MESH", "BOX BOX"),
+        *("PLANE MESH", "CAPSULE MESH"),
         *("CAPSULE CYLINDER", "ELLIPSOID CYLINDER", "CYLINDER CYLINDER"),
         *("SPHERE ELLIPSOID", "CAPSULE ELLIPSOID", "ELLIPSOID ELLIPSOID"),
         *("HFIELD SPHERE", "HFIELD CAPSULE", "HFIELD BOX", "HFIELD MESH"),

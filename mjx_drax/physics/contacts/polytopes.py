@@ -250,6 +250,10 @@ def _face_on_face(
     own = subject, jnp.roll(subject, -1, axis=0)
     of_own, own_part = jax.vmap(_part, (0, 0, None, None))(*own, clipping, out)
     of_other, other_part = jax.vmap(_part, (0, 0, None, None))(start, end, subject, facing)
+    # A polygon that is bent may not be convex: then it clips its own corners, too
+    sides = _sides(clipping, out)
+    height = jnp.sum(sides * (clipping - of_other[:, :1]), axis=2)
+    other_part &= jnp.all(height >= -SAME * jnp.linalg.norm(sides, axis=1), axis=1)
     points = jnp.concatenate([of_own[:, 1], of_other[:, 0]])  # the faces turn against each other
     depth = (points - clipping[0]) @ out
     acts = jnp.concatenate([own_part, other_part]) & (depth <= reach)
@@ -279,11 +283,16 @@ def _part(start: Array, end: Array, corners: Array, out: Array) -> tuple[Array, 
     Args:
         corners, out: of the face (n, 3), counterclockwise about its normal (3,).
     """
-    sides = jnp.cross(corners - jnp.roll(corners, 1, axis=0), out)
-    sides = jnp.where(jnp.max(jnp.abs(sides), axis=1, keepdims=True) < SAME, 0.0, sides)
+    sides = _sides(corners, out)
     left, rise = jnp.sum(sides * (corners - start), axis=1), sides @ (end - start)
     along, some = inner_part(left, rise)
     return start + along[:, None] * (end - start), some & jnp.any(start != end)
+
+
+def _sides(corners: Array, out: Array) -> Array:
+    """Ways out of a face (n, 3) across its edges, as long as these; 0 where corners are one."""
+    sides = jnp.cross(corners - jnp.roll(corners, 1, axis=0), out)
+    return jnp.where(jnp.max(jnp.abs(sides), axis=1, keepdims=True) < SAME, 0.0, sides)
 
 
 def inner_part(height: Array, rise: Array) -> tuple[Array, Array]:
