@@ -518,7 +518,8 @@ def causes(
     for part, flag in PARTS.items():
         rest = error_without(disabling(flag))
         if rest <= max(NOTICEABLE, error / 10):
-            return f"the reason is not known; without {part} it is {rest:.1e}"
+            choose = ': choose some, contacts=[("foot_*", "floor"), ...]' * (part == "contacts")
+            return f"the reason is not known; without {part} it is {rest:.1e}{choose}"
     return "the reason is not known"
 
 

@@ -37,6 +37,7 @@ from scipy.spatial import ConvexHull
 
 from mjx_drax.physics._mjx import (
     COLLISIONS,
+    ConvexMesh,
     collision_driver,
     internal,
     make_frame,
@@ -490,7 +491,27 @@ _HULLS = {(BOX, BOX), (BOX, MESH), (MESH, MESH)}
 _BETWEEN_HULLS = _function(between_hulls, 4)
 _CYLINDERS, _ELLIPSOIDS = _function(with_corners, 4), _function(with_corners, 1)
 
+
+def _with_plain_hulls(collide: Any) -> Any:
+    """A function of MJX, which knows hulls without polygons only."""
+
+    def plain(hull: Hull | None) -> ConvexMesh | None:
+        names = [field.name for field in dataclasses.fields(ConvexMesh)]
+        return hull and ConvexMesh(**{name: getattr(hull, name) for name in names})
+
+    def function(model: mjx.Model, *arguments: Any) -> Contacts:
+        hulls = tuple(map(plain, model._impl.mesh_convex))
+        found: Contacts = collide(model.tree_replace({"_impl.mesh_convex": hulls}), *arguments)
+        return found
+
+    return _function(function, collide.ncon)
+
+
 _OWN = {
+    **{
+        (kind, MESH): _with_plain_hulls(COLLISIONS[kind, MESH])
+        for kind in (HFIELD, SPHERE, CAPSULE)
+    },
     (PLANE, CAPSULE): plane_capsule,
     (PLANE, BOX): plane_box,
     (PLANE, MESH): plane_mesh,

@@ -206,6 +206,33 @@ def test_meshes_touch_boxes_and_meshes_as_in_the_c_engine(kind):
     assert np.quantile(errors, 0.9) < 1e-9
 
 
+@pytest.mark.parametrize("kind", ["sphere", "capsule"])
+def test_spheres_and_capsules_meet_meshes(kind):
+    model = meeting(kind, MESHES)
+    with jax.enable_x64(True):
+        find, errors = contacts_of(model), []
+        for wanted in approached(model, 30, 0.004):
+            errors.append(float(find(wanted).dist.min()) - wanted.contact.dist.min())
+    assert np.median(np.abs(errors)) < 1e-6  # MJX has other contacts of some capsules
+
+
+def test_meshes_lie_on_height_fields():
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><mesh name="m" vertex="{PRISM}"/>
+        <hfield name="h" nrow="4" ncol="4" size=".5 .5 .1 .1"/></asset><worldbody>
+        <geom type="hfield" hfield="h"/>
+        <body pos=".02 .03 .098"><freejoint/><geom type="mesh" mesh="m"/></body></worldbody>
+        </mujoco>"""
+    )
+    model.hfield_data[:] = 0.0
+    wanted = mujoco.MjData(model)
+    mujoco.mj_forward(model, wanted)
+    with jax.enable_x64(True):
+        found = contacts_of(model)(wanted)
+    assert wanted.ncon
+    np.testing.assert_allclose(found.dist.min(), wanted.contact.dist.min(), atol=1e-3)
+
+
 def _bumpy(seed):
     """Corners of a box whose sides are bent by 0.01 rad; one corner is there twice."""
     at = np.array(list(itertools.product((-1, -0.4, 0.3, 1), repeat=3)))
