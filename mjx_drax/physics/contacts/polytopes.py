@@ -1,8 +1,9 @@
 """Contacts of two convex polytopes: boxes and hulls of meshes.
 
 If no face separates them, the direction of least overlap is the normal of a face, or it is across
-an edge of each. As in the C engine, two faces that are nearly parallel touch in up to four points;
-else a face touches a corner, or an edge that is almost along it; else two edges touch in one point.
+an edge of each. As in the C engine, two faces there that are nearly parallel touch in up to four
+points; else a face touches a corner, or an edge that is almost along it; else two edges touch in
+one point. Of meshes these faces are the polygons of `hull`.
 
 MJX compares all edges of one with all of the other and differentiates all comparisons, which takes
 gigabytes for a state where hulls have a thousand corners. Here what touches is found without
