@@ -154,8 +154,8 @@ class Minimum:
 
     @cached_property
     def feasible(self) -> np.ndarray:
-        """Whether the largest |h| or positive g is below 1e-3, (chains,)."""
-        return (self.max_defect < FEASIBLE) & (self.died_at < 0)
+        """Whether the largest |h| or positive g is below 1e-3, and the cost finite, (chains,)."""
+        return (self.max_defect < FEASIBLE) & np.isfinite(self.cost)
 
     @cached_property
     def optimal_chains(self) -> np.ndarray:
@@ -170,7 +170,8 @@ class Minimum:
     @cached_property
     def status(self) -> list[str]:
         """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, for every chain."""
-        return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
+        diverged = (self.died_at >= 0) & ~self.feasible
+        return statuses(self.feasible, self.optimal_chains, diverged, self.interrupted)
 
     @cached_property
     def polished(self) -> list[str]:

@@ -172,8 +172,8 @@ class Results:
 
     @cached_property
     def feasible(self) -> np.ndarray:
-        """Whether max|h| < 1e-3, (chains,)."""
-        return (self.max_defect < FEASIBLE) & (self.died_at < 0)
+        """Whether max|h| < 1e-3 where the chain ended, and the cost is finite, (chains,)."""
+        return (self.max_defect < FEASIBLE) & np.isfinite(self.cost)
 
     @cached_property
     def success(self) -> np.ndarray:
@@ -201,8 +201,10 @@ class Results:
 
         Feasible is a plan that obeys the dynamics and its constraints, whether or not a replay of
         it succeeds. Interrupted is what was infeasible when the solve was ended before its time.
+        Diverged is what was infeasible when it would have turned non-finite.
         """
-        return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
+        diverged = (self.died_at >= 0) & ~self.feasible
+        return statuses(self.feasible, self.optimal_chains, diverged, self.interrupted)
 
     @cached_property
     def polished(self) -> list[str]:

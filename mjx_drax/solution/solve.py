@@ -171,7 +171,7 @@ def _certified(
         residual=np.asarray(info.residual),
         stalled=stalled_of(state),
         tolerance=tolerance_of(settings),
-        feasible_since=np.where(np.asarray(state.died_at) < 0, found.chains.feasible_since, -1),
+        feasible_since=found.chains.feasible_since,
         died_at=np.asarray(state.died_at),
         interrupted=interrupted,
         plan=plan_violations(family, plan, u),

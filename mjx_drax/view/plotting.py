@@ -380,7 +380,7 @@ def _draw_final_costs(axes: Axes, solution: Solution) -> None:
     cost = np.where(certified, solution.replay_cost, solution.cost).astype(float)
     rank = np.empty(len(cost), int)
     rank[np.argsort(cost, kind="stable")] = np.arange(1, len(cost) + 1)
-    diverged = solution.died_at >= 0
+    diverged = (solution.died_at >= 0) & ~solution.feasible
     handles: list[Artist] = []
     for name, chosen, marker, color in (
         ("optimal", solution.optimal_chains, "*", GREEN),

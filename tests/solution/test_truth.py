@@ -104,9 +104,18 @@ def test_an_infeasible_chain_does_not_succeed(solution):
     assert not lost.certified
 
 
-def test_a_chain_that_diverged_does_not_succeed(solution):
-    diverged = replace(solution, died_at=np.where(np.arange(CHAINS) == 1, 3, -1))
+def test_a_chain_that_diverged_does_not_succeed_unless_it_was_feasible_by_then(solution):
+    """It was stopped at its last finite knots, which are as good as any others."""
+    died = np.where(np.arange(CHAINS) == 1, 3, -1)
+    defect = np.where(died >= 0, 1.0, solution.max_defect)
+    diverged = replace(solution, died_at=died, max_defect=defect)
     np.testing.assert_array_equal(diverged.success, np.arange(CHAINS) != 1)
+    assert diverged.status[1] == "diverged"
+    cost = np.where(died >= 0, np.nan, solution.cost)
+    assert replace(solution, died_at=died, cost=cost).status[1] == "diverged"
+    stopped = replace(solution, died_at=died)
+    np.testing.assert_array_equal(stopped.success, solution.success)
+    assert stopped.status == solution.status
 
 
 def test_an_infeasible_problem_is_not_certified(batch):
