@@ -129,12 +129,13 @@ def save_dataset(
 ) -> Path:
     """Write trajectories of many chains as HDF5, for learning from; returns the path.
 
-    One group a solution, `000_NAME`, with n trajectories of K knots: times (K+1,); states (n, K+1,
-    nx) and controls (n, K, nu) as replayed, float64; plan_states, plan_controls and gains (n, K,
-    nu, ndx), float32; mode (n,), `open loop` or `with feedback`, whichever succeeds and is cheaper;
-    and of that replay max_deviation, final_deviation, max_violation, replay_cost and success, (n,)
-    each; chain, cost, max_defect and residual of the plan, feasible, optimal. Attributes: problem,
-    engine, seed, dt, state_names, control_names; of the file: format, mjx_drax.
+    One group a solution, `000_NAME`, with n trajectories of K knots: times (K+1,), or (n, K+1)
+    where durations are free; states (n, K+1, nx) and controls (n, K, nu) as replayed, float64;
+    plan_states, plan_controls and gains (n, K, nu, ndx), float32; mode (n,), `open loop` or `with
+    feedback`, whichever succeeds and is cheaper; and of that replay max_deviation, final_deviation,
+    max_violation, replay_cost and success, (n,) each; chain, cost, max_defect and residual of the
+    plan, feasible, optimal. Attributes: problem, engine, seed, dt, state_names, control_names; of
+    the file: format, mjx_drax.
 
     Args:
         solutions: one, or several, from `solve` or `Solution.load`.
@@ -164,7 +165,11 @@ def save_dataset(
             group.attrs["seed"], group.attrs["dt"] = solution.seed, float(problem.dynamics.dt)
             group.attrs["state_names"] = state_names(problem.dynamics)
             group.attrs["control_names"] = control_names(problem.dynamics)
-            for name, values in {"times": solution.times, **table}.items():
+            times = solution.times
+            if problem.dynamics.phases:  # each has its own
+                rows = [solution.times_of(int(chain)) for chain in table["chain"]]
+                times = np.reshape(rows, (-1, len(times)))
+            for name, values in {"times": times, **table}.items():
                 group.create_dataset(name, data=values)
     return file_path(path)
 

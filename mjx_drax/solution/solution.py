@@ -55,8 +55,9 @@ class Solution(Results):
                 `certify` again does.
 
         Raises:
-            DraxError: the files are missing, damaged or of another format, or the problem is not
-                the one that was solved.
+            DraxError: the files are missing, damaged or of another format, or the problem has
+                other sizes, another dt or x_init. Its functions are not compared: costs and
+                certificate stay as they were, until `certify`.
         """
         return load(Solution, folder, problem)
 

@@ -13,9 +13,11 @@ from mjx_drax import (
     Exporter,
     Solution,
     export_keyframes,
+    from_function,
     from_mjcf,
     save_csv,
     save_dataset,
+    solve,
 )
 from mjx_drax.base.files import complete, require
 from mjx_drax.physics.dynamics import mujoco_model
@@ -218,3 +220,24 @@ def test_a_file_appears_once_it_is_complete(tmp_path):
     with complete(target) as partial:
         partial.write_text("new")
     assert target.read_text() == "new"
+
+
+@pytest.mark.slow
+def test_a_dataset_of_free_durations_has_times_for_each_trajectory(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    problem = from_function(
+        lambda x, u, knot: x + knot.dt * u,
+        x_init=[0.0],
+        nu=1,
+        horizon=(0.2, 3.0),
+        knots=5,
+        running_cost=lambda x, u, knot: knot.dt * (1.0 + 0.1 * u @ u),
+        terminal_equality=lambda x: x - 1.0,
+        u_bounds=(-2.0, 2.0),
+    )
+    found = solve(problem, chains=3)
+    with h5py.File(save_dataset(found, tmp_path / "free.h5", everything=True)) as file:
+        (group,) = file.values()
+        assert group["times"].shape == (3, 6)
+        for times, chain in zip(group["times"][:], group["chain"][:], strict=True):
+            np.testing.assert_array_equal(times, found.times_of(int(chain)))
