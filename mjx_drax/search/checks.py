@@ -29,6 +29,10 @@ from mjx_drax.problem.tracing import require_derivatives
 from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.search.iterate import FEASIBLE
 
+LARGE = 1e4
+"""Constraints above this, at the initial knots, are in units too small. The penalty of the noise
+knows no units of rows, the polish does: programs end diverged at 3e4, motions at 1e6."""
+
 _POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
 
 
@@ -184,7 +188,8 @@ def require_sound(
         DraxError: naming the function, where it fails and the fix.
 
     Warns:
-        DraxWarning: alone, it has an x_init that breaks a constraint, whatever the controls are.
+        DraxWarning: alone, it has an x_init that breaks a constraint, whatever the controls are; or
+            constraints in units too small.
     """
     flow = replace(flow, scale=Scale())  # of one type, measured or not
     stages, end = _starts(flow, problem, knots)
@@ -200,9 +205,28 @@ def require_sound(
                 "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
                 f"move {move}."
             )
+    if alone:
+        _warn_of_size(constraints)
     if alone and problem.start_map is None:
         u = np.asarray(stages)[:, 0, problem.dynamics.nx :]
-        _warn_of_start(u, {name: np.asarray(a)[:, 0] for name, a in constraints.items()})
+        at_start = {n: a for n, a in constraints.items() if not n.startswith("terminal")}
+        _warn_of_start(u, {name: np.asarray(a)[:, 0] for name, a in at_start.items()})
+
+
+def _warn_of_size(constraints: dict[str, Array]) -> None:
+    """Warn of constraints (chains, 1, m) that are `LARGE`."""
+    for name, values in constraints.items():
+        size = np.abs(np.nan_to_num(np.asarray(values, float), nan=0.0, posinf=0.0, neginf=0.0))
+        row = int(size.max(axis=(0, 1), initial=0.0).argmax()) if size.size else 0
+        largest = float(size[..., row].max()) if size.size else 0.0
+        if largest > LARGE:
+            warnings.warn(
+                f"{name} [{row}] is {largest:.1e} at the initial knots, and chains may not "
+                f"converge: divide it by {10.0 ** round(np.log10(largest)):.0e}, so that it is of "
+                "order one.",
+                DraxWarning,
+                stacklevel=2,
+            )
 
 
 def _warn_of_start(u: np.ndarray, constraints: dict[str, np.ndarray]) -> None:
@@ -278,8 +302,8 @@ def _finite(
 ) -> tuple[dict[str, list[Array]], dict[str, Array]]:
     """Whether functions, first and second derivatives are finite at z = [x, u], (chains, n) each.
 
-    Derivatives are taken in one direction that moves every number. Also the values of constraints
-    of a stage, (chains, n, m).
+    Derivatives are taken in one direction that moves every number. Also the values of constraints,
+    (chains, n, m).
 
     Args:
         problem: whose functions.
@@ -301,7 +325,7 @@ def _finite(
         found[label] = [
             jnp.isfinite(each).reshape(*each.shape[:2], -1).all(axis=-1) for each in orders
         ]
-        if label in ("equality", "inequality"):
+        if label.endswith("equality"):
             constraints[label] = orders[0].reshape(*orders[0].shape[:2], -1)
     return found, constraints
 

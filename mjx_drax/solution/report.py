@@ -192,6 +192,13 @@ def _advice(solution: Results) -> str:
     if solution.interrupted:
         return "the solve was interrupted. Let it go on to its end."
     where = solution.where(solution.best_chain)
+    problem = solution.problem
+    stage = where is not None and where.kind in ("equality", "inequality")
+    if where is not None and stage and where.knot == 0 and not problem.free:
+        return (
+            f"no plan is feasible; the best {where.told(problem)}, where the state is x_init. Move "
+            "x_init, let the constraint hold later only (`between`), or widen the controls' bounds."
+        )
     if where is not None:
         bounded, share = _most_bounded(solution)
         unfinished = solution.polished[solution.best_chain] == UNFINISHED

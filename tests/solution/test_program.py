@@ -3,6 +3,7 @@
 min c(x)   s.t.   h(x) = 0,   g(x) <= 0,   lower <= x <= upper
 """
 
+import warnings
 from dataclasses import replace
 
 import jax
@@ -261,3 +262,19 @@ def test_minimize_names_what_it_cannot_take(linear):
 def test_a_guess_that_is_a_number_is_named(linear):
     with pytest.raises(DraxError, match="guess"):
         minimize(linear, chains=2, guess=0.0)
+
+
+@pytest.mark.parametrize("units", [1.0, 1e3])
+def test_constraints_in_units_that_are_too_small_are_warned_of(units):
+    program = from_program(
+        4,
+        cost=lambda x: x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2],
+        equality=lambda x: units * jnp.array([x @ x - 40.0]),
+        bounds=(1.0, 5.0),
+    )
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        minimize(program, chains=2, max_iterations=1)
+    said = [str(w.message) for w in told if "divide it by" in str(w.message)]
+    assert len(said) == (units > 1)
+    assert all("equality [0] is" in text for text in said)
