@@ -151,9 +151,9 @@ def of_hulls(one: Hull, other: Hull, alike: int = 1) -> Contacts:
     chosen, new = _spanning(lax.stop_gradient(points), dist < APART, lax.stop_gradient(normals[0]))
     points, dist = points[chosen], jnp.where(new, dist[chosen], APART)
     # As in the C engine: from the point on the first polygon, along the normal of the second one
-    way = jnp.where(dist < APART, dist, 0.0)[:, None] * normals[0]
+    above = jnp.where(dist < APART, dist, 0.0)[:, None]
     along = -normals[0] @ normals[1]
-    pos = points - way - 0.5 * (way @ normals[0])[:, None] * along * normals[1]
+    pos = points - above * (normals[0] + 0.5 * along * normals[1])
     touch = jnp.where(dist < APART, along * dist, APART), pos, -normals[1]
     # Only polygons that are nearly parallel touch as such
     flat = (jnp.min(cosine) < -FLAT) & (jnp.min(lax.stop_gradient(dist)) < 0)
@@ -168,7 +168,7 @@ def of_hulls(one: Hull, other: Hull, alike: int = 1) -> Contacts:
 
 
 def _corners(hull: Hull, polygon: Array, most: int | None = None) -> Array:
-    """Corners of a polygon (most, 3)."""
+    """Corners of a polygon (n, 3), the last one repeated up to `most`."""
     found = hull.vert[hull.polygon[polygon]]
     return found if most is None else _padded(found, most)
 
