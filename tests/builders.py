@@ -76,6 +76,32 @@ def double_integrator(f=None, **changes):
     return from_function(f or (lambda x, u: x + DT * jnp.stack([x[1], u[0]])), **given | changes)
 
 
+GOAL = np.array([1.0, 0.0])
+"""Of `fastest`."""
+
+
+def pushed(x, u, knot):
+    """A unit mass pushed by u, held over the step."""
+    h = knot.dt
+    return jnp.stack([x[0] + h * x[1] + 0.5 * h * h * u[0], x[1] + h * u[0]])
+
+
+def fastest(**changes):
+    """The double integrator from rest to rest in the least time, |u| <= 1."""
+    given = {
+        "f": pushed,
+        "x_init": np.zeros(2),
+        "nu": 1,
+        "horizon": (0.5, 5.0),
+        "knots": 20,
+        "running_cost": lambda x, u, knot: knot.dt,
+        "terminal_equality": lambda x: x - GOAL,
+        "u_bounds": (-1.0, 1.0),
+        "name": "fastest",
+    }
+    return from_function(**given | changes)
+
+
 def matrices(push=None):
     """G and c of x_1..x_K = G u + c for the double integrator with an acceleration push (K,)."""
     A, B = np.array([[1, DT], [0, 1.0]]), np.array([0, DT])

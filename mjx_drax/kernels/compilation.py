@@ -61,19 +61,16 @@ def rarely_collected() -> Iterator[None]:
     until a quadruped's first iteration.
     """
     with _RARELY:
-        if not _rarely:
-            before = gc.get_threshold()
-            gc.set_threshold(100 * before[0], *before[1:])
-        else:
-            before = _rarely[0]
-        _rarely.append(before)
+        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
+        first, *rest = _rarely[0]
+        gc.set_threshold(100 * first, *rest)
     try:
         yield
     finally:
-        with _RARELY:  # the last one, of all threads, to leave
-            if len(_rarely) == 1:
+        with _RARELY:
+            before = _rarely.pop()
+            if not _rarely:  # the last one, of all threads
                 gc.set_threshold(*before)
-            _rarely.pop()
 
 
 @rarely_collected()

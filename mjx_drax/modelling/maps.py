@@ -56,9 +56,10 @@ def dark_pixels(picture: str | Path | ArrayLike, threshold: float) -> np.ndarray
 
         try:
             with Image.open(picture) as opened:
-                deep = opened.mode.startswith("I")  # 16 bits, which "L" would cut off at 255
-                picture = np.asarray(opened if deep else opened.convert("L"))
-                picture = picture.astype(np.uint16) if deep else picture
+                if opened.mode.startswith("I"):  # 16 bits, which "L" would cut off at 255
+                    picture = np.asarray(opened).astype(np.uint16)
+                else:
+                    picture = np.asarray(opened.convert("L"))
         except (OSError, ValueError) as error:
             raise DraxError(
                 f"the image {shown(str(picture))} cannot be read: give a file such as map.png."

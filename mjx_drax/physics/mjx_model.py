@@ -182,13 +182,16 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
     model.sensor_intprm[unknown, 0] = NOT_COMPUTED  # clocks have none
 
 
-def hold_by_inertia(model: mujoco.MjModel) -> np.ndarray:
-    """Change a model as `HELD` says; the degrees of freedom that are held, (nv,)."""
-    held = np.asarray(model.dof_damping * model.opt.timestep > HELD * model.dof_M0)
-    # as the integrator does
+def held_dofs(model: mujoco.MjModel) -> np.ndarray:
+    """Degrees of freedom that damping holds where they are, as `HELD` says, (nv,)."""
+    return np.asarray(model.dof_damping * model.opt.timestep > HELD * model.dof_M0)
+
+
+def hold_by_inertia(model: mujoco.MjModel) -> None:
+    """Change a model, so that inertia holds what damping held, as the integrator does."""
+    held = held_dofs(model)
     model.dof_armature[held] += model.opt.timestep * model.dof_damping[held]
     model.dof_damping[held] = 0.0
-    return held
 
 
 def _pairs(model: mujoco.MjModel, without: set[Pair]) -> list[tuple[int, int, int]]:

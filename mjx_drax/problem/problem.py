@@ -9,6 +9,7 @@ are solved for. There is no hidden factor dt: a running cost is summed over knot
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -20,7 +21,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import DraxError, reason, require_whole, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, reason, require_whole, shown
 from mjx_drax.base.numbers import vector
 from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass, with_host_fields
 from mjx_drax.kernels.pruning import pruned
@@ -440,16 +441,30 @@ class Problem:
         if self.goal is None:
             return None
         time = float(self.times[-1]) if time is None else time
-        return bool(self.all_reached(x[None], [time])[0])
+        return self._met(self.dynamics.observer(), x, time)
 
     def all_reached(self, x: np.ndarray, times: Sequence[float]) -> np.ndarray:
-        """`reached` of many ends x (n, nx) at their times, (n,); those not finite do not."""
-        observe = self.dynamics.observer()
-        pairs = zip(x, times, strict=True)
-        return np.array([np.isfinite(x).all() and self._met(observe, x, t) for x, t in pairs], bool)
+        """`reached` of many ends x (n, nx) at their times, (n,); those not finite do not.
+
+        Warns:
+            DraxWarning: it fails for some, which then do not reach it: all is computed by now.
+        """
+        observe, found = self.dynamics.observer(), np.zeros(len(x), bool)
+        failed: DraxError | None = None
+        for i, (end, time) in enumerate(zip(x, times, strict=True)):
+            try:
+                found[i] = self._met(observe, end, time)
+            except DraxError as error:
+                failed = error
+        if failed is not None:
+            words = f"{failed} No motion counts as there where it fails."
+            warnings.warn(words, DraxWarning, stacklevel=2)
+        return found
 
     def _met(self, observe: Callable[[np.ndarray, float], Any], x: np.ndarray, time: float) -> bool:
         assert self.goal is not None
+        if not np.isfinite(x).all():
+            return False
         try:
             reached = np.asarray(self.goal(observe(x, time)))
         except Exception as error:

@@ -216,10 +216,11 @@ def require_sound(
 def _warn_of_size(constraints: dict[str, Array]) -> None:
     """Warn of constraints (chains, 1, m) that are `LARGE`."""
     for name, values in constraints.items():
-        size = np.abs(np.nan_to_num(np.asarray(values, float), nan=0.0, posinf=0.0, neginf=0.0))
-        row = int(size.max(axis=(0, 1), initial=0.0).argmax()) if size.size else 0
-        largest = float(size[..., row].max()) if size.size else 0.0
+        finite = np.where(np.isfinite(values), np.abs(values), 0.0)
+        sizes = finite.max(axis=(0, 1), initial=0.0)
+        largest = float(sizes.max(initial=0.0))
         if largest > LARGE:
+            row = int(sizes.argmax())
             warnings.warn(
                 f"{name} [{row}] is {largest:.1e} at the initial knots, and chains may not "
                 f"converge: divide it by {10.0 ** round(np.log10(largest)):.0e}, so that it is of "

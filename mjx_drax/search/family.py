@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_drax.base.errors import DraxError, DraxWarning, reason, shown
+from mjx_drax.base.errors import DraxError, reason, shown
 from mjx_drax.base.pytrees import with_host_fields
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.schedules import Scale
@@ -306,11 +305,7 @@ class Family:
         def asked(problem: Problem, motions: np.ndarray) -> np.ndarray:
             times, begin = problem.dynamics.times, float(problem.t_init)
             ends = [float(times(motion, begin)[-1]) for motion in motions]
-            try:
-                return problem.all_reached(motions[:, -1], ends)
-            except DraxError as error:  # a function of the user's, after all that was computed
-                warnings.warn(f"{error} No motion counts as there.", DraxWarning, stacklevel=2)
-                return np.zeros(len(motions), bool)
+            return problem.all_reached(motions[:, -1], ends)
 
         if self.alone or not (self.nth or self.varies("dynamics", "t_init")):
             return asked(self.at(0), states)

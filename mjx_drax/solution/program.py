@@ -170,8 +170,7 @@ class Minimum:
     @cached_property
     def status(self) -> list[str]:
         """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, for every chain."""
-        diverged = (self.died_at >= 0) & ~self.feasible
-        return statuses(self.feasible, self.optimal_chains, diverged, self.interrupted)
+        return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
 
     @cached_property
     def polished(self) -> list[str]:

@@ -192,14 +192,14 @@ def _advice(solution: Results) -> str:
     if solution.interrupted:
         return "the solve was interrupted. Let it go on to its end."
     where = solution.where(solution.best_chain)
-    problem = solution.problem
-    stage = where is not None and where.kind in ("equality", "inequality")
-    if where is not None and stage and where.knot == 0 and not problem.free:
-        return (
-            f"no plan is feasible; the best {where.told(problem)}, where the state is x_init. Move "
-            "x_init, let the constraint hold later only (`between`), or widen the controls' bounds."
-        )
     if where is not None:
+        told = f"no plan is feasible; the best {where.told(solution.problem)}"
+        of_stage = where.kind in ("equality", "inequality")
+        if of_stage and where.knot == 0 and not solution.problem.free:
+            return (
+                f"{told}, where the state is x_init. Move x_init, let the constraint hold later "
+                "only (`between`), or widen the controls' bounds."
+            )
         bounded, share = _most_bounded(solution)
         unfinished = solution.polished[solution.best_chain] == UNFINISHED
         more = ["more iterations"] + ["more max_iterations"] * unfinished
@@ -207,10 +207,7 @@ def _advice(solution: Results) -> str:
         more.append("longer durations" if free else "a longer horizon")
         if share >= 0.5:  # it does all it may, and time or room is what is missing
             more = ["wider bounds", *more[::-1]]
-        return (
-            f"no plan is feasible; the best {where.told(solution.problem)}{bounded}. "
-            f"Try {', '.join(more[:-1])}, or {more[-1]}."
-        )
+        return f"{told}{bounded}. Try {', '.join(more[:-1])}, or {more[-1]}."
     unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])
     if unplanned is not None:
         knot, contact = unplanned

@@ -203,8 +203,7 @@ class Results:
         it succeeds. Interrupted is what was infeasible when the solve was ended before its time.
         Diverged is what was infeasible when it would have turned non-finite.
         """
-        diverged = (self.died_at >= 0) & ~self.feasible
-        return statuses(self.feasible, self.optimal_chains, diverged, self.interrupted)
+        return statuses(self.feasible, self.optimal_chains, self.died_at >= 0, self.interrupted)
 
     @cached_property
     def polished(self) -> list[str]:
@@ -369,7 +368,7 @@ def statuses(
     names = np.where(optimal, OPTIMAL, np.where(feasible, FEASIBLE_ONLY, INFEASIBLE))
     if interrupted:
         names = np.where(feasible, names, INTERRUPTED)
-    found: list[str] = np.where(diverged, DIVERGED, names).tolist()
+    found: list[str] = np.where(diverged & ~feasible, DIVERGED, names).tolist()
     return found
 
 

@@ -184,8 +184,10 @@ class Violation(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Its size in multiples of what is tolerated; infinite where nothing is."""
-        return self.size / self.allowed if self.allowed else np.inf * self.size
+        """Its size in multiples of what is tolerated; infinite where nothing is, 0 if it is 0."""
+        if not self.size:
+            return 0.0
+        return self.size / self.allowed if self.allowed else np.inf
 
     def told(self, problem: Problem) -> str:
         """What is broken, by how much, where and when, in words."""
@@ -530,4 +532,4 @@ def worst_knots(
             if a == a  # NaN is not equal to itself
         ]
         if column:
-            yield max(column, key=lambda v: v.ratio if v.size else 0.0)  # 0 of 0 is no ratio
+            yield max(column, key=lambda v: v.ratio)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import DT, K, arm, double_integrator, matrices, robot
+from builders import DT, GOAL, K, arm, double_integrator, fastest, matrices, robot
 
 from mjx_drax import (
     Constant,
@@ -27,30 +27,6 @@ from mjx_drax import (
     solve_batch,
 )
 from mjx_drax.solution.names import state_names
-
-GOAL = np.array([1.0, 0.0])
-
-
-def pushed(x, u, knot):
-    """A unit mass pushed by u, held over the step."""
-    h = knot.dt
-    return jnp.stack([x[0] + h * x[1] + 0.5 * h * h * u[0], x[1] + h * u[0]])
-
-
-def fastest(**changes):
-    """The double integrator from rest to rest in the least time, |u| <= 1."""
-    given = {
-        "f": pushed,
-        "x_init": np.zeros(2),
-        "nu": 1,
-        "horizon": (0.5, 5.0),
-        "knots": 20,
-        "running_cost": lambda x, u, knot: knot.dt,
-        "terminal_equality": lambda x: x - GOAL,
-        "u_bounds": (-1.0, 1.0),
-        "name": "fastest",
-    }
-    return from_function(**given | changes)
 
 
 @pytest.mark.slow

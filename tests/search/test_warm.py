@@ -5,9 +5,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import DT, K, double_integrator
+from builders import DT, K, double_integrator, fastest
 
-from mjx_drax import DraxError, Polish, Restarts, Trajectory, from_function, solve
+from mjx_drax import DraxError, Polish, Restarts, Trajectory, solve
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.warm import require_alike
 from mjx_drax.solution.solve import warm_of
@@ -90,18 +90,10 @@ def test_guesses_with_another_x_0_or_other_inequalities_are_refused(cold):
 
 def test_the_step_of_a_guess_is_the_step_of_its_first_knot():
     """So the best knots of a free duration are a guess; and `start` has to fit."""
-    problem = from_function(
-        lambda x, u, knot: x + knot.dt * u,
-        x_init=[0.0],
-        nu=1,
-        horizon=(0.5, 3.0),
-        knots=5,
-        running_cost=lambda x, u, knot: knot.dt,
-        u_bounds=(-1.0, 1.0),
-    )
-    x = np.tile([[0.2, 0.35]], (5, 1))
+    problem = fastest(knots=5)
+    x = np.tile([[0.2, 0.1, 0.35]], (5, 1))
     knots = initial_knots(problem, 2, Trajectory(x, np.ones((5, 1))), None)
-    np.testing.assert_allclose(problem.x_init[1] + knots.start, 0.35, rtol=1e-6)
+    np.testing.assert_allclose(problem.x_init[2] + knots.start, 0.35, rtol=1e-6)
     for start, words in (([1.0, 2.0], "give 1 finite numbers"), ([np.nan], "give 1 finite")):
         with pytest.raises(DraxError, match=words):
             initial_knots(problem, 2, Trajectory(x, np.ones((5, 1)), start=start), None)

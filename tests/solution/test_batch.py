@@ -305,3 +305,7 @@ def test_a_goal_that_fails_at_the_end_loses_nothing():
     family = Family.of_one(replace(BASE, goal=lambda x: x[7] > 0))
     with pytest.warns(DraxWarning, match="goal failed .* No motion counts as there"):
         assert not family.reached(np.zeros(2, int), np.zeros((2, 11, 2))).any()
+    picky = Family.of_one(replace(BASE, goal=lambda x: bool(1.0 / x[0] > 0)))
+    ends = np.broadcast_to(np.array([[0.0], [1.0]])[..., None], (2, 11, 2))
+    with pytest.warns(DraxWarning, match="where it fails"), np.errstate(divide="raise"):
+        assert picky.reached(np.zeros(2, int), ends).tolist() == [False, True]

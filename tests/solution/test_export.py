@@ -6,14 +6,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from builders import made_up, point
+from builders import fastest, made_up, point
 
 from mjx_drax import (
     DraxError,
     Exporter,
     Solution,
     export_keyframes,
-    from_function,
     from_mjcf,
     save_csv,
     save_dataset,
@@ -225,17 +224,7 @@ def test_a_file_appears_once_it_is_complete(tmp_path):
 @pytest.mark.slow
 def test_a_dataset_of_free_durations_has_times_for_each_trajectory(tmp_path):
     h5py = pytest.importorskip("h5py")
-    problem = from_function(
-        lambda x, u, knot: x + knot.dt * u,
-        x_init=[0.0],
-        nu=1,
-        horizon=(0.2, 3.0),
-        knots=5,
-        running_cost=lambda x, u, knot: knot.dt * (1.0 + 0.1 * u @ u),
-        terminal_equality=lambda x: x - 1.0,
-        u_bounds=(-2.0, 2.0),
-    )
-    found = solve(problem, chains=3)
+    found = solve(fastest(knots=5), chains=3)
     with h5py.File(save_dataset(found, tmp_path / "free.h5", everything=True)) as file:
         (group,) = file.values()
         assert group["times"].shape == (3, 6)

@@ -6,7 +6,6 @@ the engines with it and without it.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,7 @@ from mjx_drax.physics.mjx_model import (
     LIMIT,
     OTHER_CONTACTS,
     PAIRS,
-    hold_by_inertia,
+    held_dofs,
     unknown_sensors,
 )
 
@@ -146,7 +145,7 @@ def set_aside(model: mujoco.MjModel) -> list[str]:
     found = []
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         found.append("bodies do not fall asleep in a plan: clear the flag sleep")
-    held = hold_by_inertia(copy.deepcopy(model))
+    held = held_dofs(model)
     if held.any():
         joints = [str(model.joint(j).name or j) for j in np.unique(model.dof_jntid[held])]
         found.append(

@@ -13,7 +13,7 @@
   points on them.
 - Two polytopes touch where the C engine has it, at every point once, and halfway between their
   faces; hulls of meshes take less memory (`polytopes`).
-- Hulls of meshes have the normals of their faces; see `polytope`. Pairs of hulls of similar sizes
+- Hulls of meshes have the normals of their faces; see `hull`. Pairs of hulls of similar sizes
   are one computation, where MJX has one for each pair, which takes seconds each to compile.
 - Pairs of geoms can be left out, by `exclude_signature` of the MJX model.
 """

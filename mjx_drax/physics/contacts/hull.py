@@ -129,14 +129,16 @@ def hull_of(model: mujoco.MjModel, which: int) -> Hull:
     vertices = np.asarray(model.mesh_vert[model.mesh_vertadr[which] + own], float)
     place = {int(v): i for i, v in enumerate(own)}
     first = model.mesh_polyadr[which]
+    every = slice(first, first + model.mesh_polynum[which])
     polygons = []
-    for g in range(first, first + model.mesh_polynum[which]):
-        start = model.mesh_polyvertadr[g]
-        corners = model.mesh_polyvert[start : start + model.mesh_polyvertnum[g]]
+    for start, count in zip(
+        model.mesh_polyvertadr[every], model.mesh_polyvertnum[every], strict=True
+    ):
+        corners = model.mesh_polyvert[start : start + count]
         # The C engine measures depths from the last corner
-        polygons.append((tuple(place[int(v)] for v in np.roll(corners, 1)), g))
-    normals = np.asarray(model.mesh_polynormal[[g for _, g in polygons]], float)
-    return _polytope_of(vertices.tobytes(), tuple(c for c, _ in polygons), normals.tobytes())
+        polygons.append(tuple(place[int(v)] for v in np.roll(corners, 1)))
+    normals = np.asarray(model.mesh_polynormal[every], float)
+    return _polytope_of(vertices.tobytes(), tuple(polygons), normals.tobytes())
 
 
 @lru_cache(1000)
