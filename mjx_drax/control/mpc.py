@@ -336,7 +336,7 @@ class MPC:
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
         )
-        settings = self._flow, self._heated, self._polish, problem
+        settings = self._flow, self._heated, self._polish, search.family.problem
         leaves, structure = jax.tree.flatten(settings)
         self._settings = jax.device_put(leaves)
         carried = _first(found.chains, self.explorers, self.seed, self._polish)

@@ -178,9 +178,11 @@ def _expand_costs(
         def moved(dz: Array) -> tuple[Any, ...]:
             return here.seen(dynamics.integrate(x, dz[:ndx]), u + dz[ndx:])
 
-        return here.running.expand(moved, ndx + nu, by, key), by.jacobian(
-            lambda dz: here.constraint(*moved(dz)), ndx + nu, key
-        )
+        def constrained(dz: Array) -> Array:
+            return here.constraint.in_units(here.constraint(*moved(dz)))
+
+        cost = here.running.expand(moved, ndx + nu, by, key)
+        return cost, by.jacobian(constrained, ndx + nu, key)
 
     def end(dx: Array) -> tuple[Any, ...]:
         return problem.end.seen(dynamics.integrate(trajectory.x[-1], dx))
@@ -188,7 +190,12 @@ def _expand_costs(
     (g, H), (J, values) = jax.vmap(stage)(*problem.stages(trajectory), keys[:-1])
     last = problem.end
     g_end, H_end = last.terminal.expand(end, ndx, by, keys[-1])
-    J_end, values_end = by.jacobian(lambda dx: last.terminal_constraint(*end(dx)), ndx, keys[-1])
+    at_end = last.terminal_constraint
+
+    def constrained_end(dx: Array) -> Array:
+        return at_end.in_units(at_end(*end(dx)))
+
+    J_end, values_end = by.jacobian(constrained_end, ndx, keys[-1])
     cost = QuadraticCost(
         jnp.concatenate([g[:, :ndx], g_end[None]]),
         g[:, ndx:],

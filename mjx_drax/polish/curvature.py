@@ -34,10 +34,11 @@ def with_exact_hessian(
     by = dynamics.step_differentiator(by)
     H = _of_stages(problem, knots, multipliers, by.hessian)
     last = problem.end
+    force = last.terminal_constraint.in_units(rows.terminal)
 
     def end(dx: Array) -> Array:
         seen = last.seen(dynamics.integrate(knots.x[-1], dx))
-        return last.terminal(*seen) + jnp.dot(rows.terminal, last.terminal_constraint(*seen))
+        return last.terminal(*seen) + jnp.dot(force, last.terminal_constraint(*seen))
 
     H_end = by.hessian(end, ndx) if ndx else jnp.zeros((0, 0))
     return QuadraticCost(
@@ -80,6 +81,7 @@ def _of_stages(
 
     def stage(x: Array, u: Array, knot: Knot, x_next: Array, lambda_: Array, force: Array) -> Array:
         here = problem.at(knot)
+        force = here.constraint.in_units(force)
 
         def lagrangian(dz: Array) -> Array:
             moved = dynamics.integrate(x, dz[:ndx]), u + dz[ndx:]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from inspect import signature
 from typing import Any
@@ -158,27 +158,38 @@ class Cost:
 @register_dataclass
 @dataclass(frozen=True)
 class Constraint:
-    """equality(...) = 0 and inequality(...) <= 0, either part optional; rows in that order."""
+    """equality(...) = 0 and inequality(...) <= 0, either part optional; rows in that order.
+
+    Attributes:
+        equality, inequality: the functions.
+        equalities, inequalities: their rows.
+        unit: what plans measure each row in, (rows,); None: as the user has them.
+    """
 
     equality: Partial | None
     inequality: Partial | None
     equalities: int = field(metadata=Static)
     inequalities: int = field(metadata=Static)
+    unit: Array | None = None
 
     def __call__(self, *arguments: Any) -> Array:
         """Both parts in one vector, (equalities + inequalities,)."""
         parts = [p for p in (self.equality, self.inequality) if p is not None]
         return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
 
+    def in_units(self, values: Array) -> Array:
+        """Values (..., rows), divided by their units."""
+        return values if self.unit is None else values / self.unit
+
     def at(self, knot: Knot) -> Constraint:
         """The same constraint at one knot."""
         parts = at_knot(self.equality, knot), at_knot(self.inequality, knot)
-        return Constraint(*parts, self.equalities, self.inequalities)
+        return replace(self, equality=parts[0], inequality=parts[1])
 
     def in_float64(self) -> Constraint:
         """The same constraint for float64; see `Problem.in_float64`."""
         parts = in_float64(self.equality), in_float64(self.inequality)
-        return Constraint(*parts, self.equalities, self.inequalities)
+        return replace(self, equality=parts[0], inequality=parts[1])
 
     @property
     def rows(self) -> int:

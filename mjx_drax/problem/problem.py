@@ -225,9 +225,13 @@ class Problem:
         return jax.vmap(defect)(*self.stages(trajectory), trajectory.x)
 
     def constraints(self, trajectory: Trajectory) -> Stagewise:
-        """Values [equality; inequality] at the stages (K, m) and at the end (m_end,)."""
+        """Values [equality; inequality] at the stages (K, m) and at the end (m_end,).
+
+        In the units of the constraints, if they have any.
+        """
         stages = jax.vmap(self.running_constraint)(*self.stages(trajectory))
-        return Stagewise(stages, self.end_constraint(trajectory.x[-1]))
+        end = self.end_constraint(trajectory.x[-1])
+        return Stagewise(self.constraint.in_units(stages), self.terminal_constraint.in_units(end))
 
     def inequalities(self, trajectory: Trajectory) -> Stagewise | None:
         """g at the stages (K, mg) and at the end (mg_end,); None if the problem has no g."""

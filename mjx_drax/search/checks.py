@@ -29,10 +29,6 @@ from mjx_drax.problem.tracing import require_derivatives
 from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.search.iterate import FEASIBLE
 
-LARGE = 1e4
-"""Constraints above this, at the initial knots, are in units too small. The penalty of the noise
-knows no units of rows, the polish does: programs end diverged at 3e4, motions at 1e6."""
-
 _POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
 
 
@@ -188,8 +184,7 @@ def require_sound(
         DraxError: naming the function, where it fails and the fix.
 
     Warns:
-        DraxWarning: alone, it has an x_init that breaks a constraint, whatever the controls are; or
-            constraints in units too small.
+        DraxWarning: alone, it has an x_init that breaks a constraint, whatever the controls are.
     """
     flow = replace(flow, scale=Scale())  # of one type, measured or not
     stages, end = _starts(flow, problem, knots)
@@ -205,29 +200,10 @@ def require_sound(
                 "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
                 f"move {move}."
             )
-    if alone:
-        _warn_of_size(constraints)
     if alone and problem.start_map is None:
         u = np.asarray(stages)[:, 0, problem.dynamics.nx :]
         at_start = {n: a for n, a in constraints.items() if not n.startswith("terminal")}
         _warn_of_start(u, {name: np.asarray(a)[:, 0] for name, a in at_start.items()})
-
-
-def _warn_of_size(constraints: dict[str, Array]) -> None:
-    """Warn of constraints (chains, 1, m) that are `LARGE`."""
-    for name, values in constraints.items():
-        finite = np.where(np.isfinite(values), np.abs(values), 0.0)
-        sizes = finite.max(axis=(0, 1), initial=0.0)
-        largest = float(sizes.max(initial=0.0))
-        if largest > LARGE:
-            row = int(sizes.argmax())
-            warnings.warn(
-                f"{name} [{row}] is {largest:.1e} at the initial knots, and chains may not "
-                f"converge: divide it by {10.0 ** round(np.log10(largest)):.0e}, so that it is of "
-                "order one.",
-                DraxWarning,
-                stacklevel=2,
-            )
 
 
 def _warn_of_start(u: np.ndarray, constraints: dict[str, np.ndarray]) -> None:

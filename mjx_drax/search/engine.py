@@ -75,6 +75,7 @@ from mjx_drax.search.restarts import Restarts, scale_of
 from mjx_drax.search.settings import to_data
 from mjx_drax.search.shooting import Shots, shoot
 from mjx_drax.search.sizes import Sizes, median, scale_and_floor, sizes_of
+from mjx_drax.search.units import to_units, units_of
 from mjx_drax.search.warm import Warm, warmed
 
 REPORT_EVERY = 20
@@ -119,7 +120,7 @@ class Search:
     """The attempts of one call.
 
     Attributes:
-        family: the problems.
+        family: the problems; once it runs, with the units of their constraints.
         chains: of each problem.
         seed: of all random numbers.
         settings: with a value for everything.
@@ -229,9 +230,14 @@ class Search:
         indices = np.resize(everyone, self.size)
         knots, keys = self._drawn(0, indices)
         saved = self.checkpoint is not None and self.checkpoint.found is not None
+        mine = knots if family.alone else jax.tree.map(lambda a: a[:places], knots)
+        if self.settings.descent is not None:
+            self.family = family = family.in_units(units_of(family.at(0), mine))
+        if isinstance(self.guess, Warm):
+            own = to_units(family.problem, self.guess.knots, self.guess.multipliers)
+            self.guess = replace(self.guess, knots=own[0], multipliers=own[1])
         one = family.at(0)
         if not saved:
-            mine = knots if family.alone else jax.tree.map(lambda a: a[:places], knots)
             flow = self.settings.first(1.0)
             with_f = not family.problem.dynamics.checked
             require_sound(flow, one, mine, with_f, family.alone)

@@ -19,8 +19,9 @@ from mjx_drax.method.schedules import Scale
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem, checked
 from mjx_drax.problem.tracing import plain
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.search.iterate import Question, partition
+from mjx_drax.search.units import with_units
 
 LESS_FEEDBACK = (0.3, 0.1, 0.03)
 """Shares of the feedback gains that are tried where a replay with all of them leaves its plan."""
@@ -242,6 +243,14 @@ class Family:
         tree = jax.tree.structure(self.problem)
         axes = jax.tree.unflatten(tree, [0 if d else None for d in self.differs])
         return jax.vmap(function, in_axes=(axes,))(self.problem)
+
+    def in_units(self, units: Stagewise | None) -> Family:
+        """The same problems with all their constraints measured in these units."""
+        tree = jax.tree.structure(self.problem)
+        flags = jax.tree.unflatten(tree, self.differs)
+        shared: Any = jax.tree.map(lambda _: False, units)
+        differs = tuple(jax.tree.leaves(with_units(flags, shared)))
+        return replace(self, problem=with_units(self.problem, units), differs=differs)
 
     @property
     def parts(self) -> tuple[Problem, Problem]:

@@ -173,7 +173,7 @@ class BatchSolution:
             return None
         problem, plan, u = self.family.at(i), self.x[i].astype(float), self.u[i]
         found = plan_violations(Family.of_one(problem), plan[None], u[None]).of(0)
-        return most_broken(found, largest_defect(problem, plan, u))
+        return most_broken(problem, found, largest_defect(problem, plan, u))
 
     @property
     def open_loop_is_better(self) -> np.ndarray:
@@ -255,7 +255,7 @@ def solve_batch(
         with report as search.chunk_done, said_plainly("the solve of problems"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
-        return _certified(family, settings, chains, found, interrupted, tolerances)
+        return _certified(search.family, settings, chains, found, interrupted, tolerances)
 
 
 def _certified(

@@ -32,6 +32,7 @@ from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.search.units import to_units
 from mjx_drax.solution.log import history_of, table
 from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
@@ -183,7 +184,7 @@ class Minimum:
             return None
         states, u = np.zeros((1, 2, 0)), self.x[chain, None, None]
         found = plan_violations(Family.of_one(self.program), states, u).of(0)
-        return most_broken(found)
+        return most_broken(self.program, found)
 
     @cached_property
     def best_chain(self) -> int:
@@ -231,8 +232,12 @@ def minimize(
         search = Search(own, chains, seed, settings, mesh=mesh, guess=knots)
         with report as search.progress, said_plainly(f"the solve of {program.name}"):
             found = search.run()
-        state, info, rows = found.chains.state, found.chains.info, program.constraint.equalities
-        multipliers = np.asarray(state.multipliers.constraints.stage[:, 0])
+        program, state, info = search.family.problem, found.chains.state, found.chains.info
+        _, forces = to_units(program, state.trajectory, state.multipliers, back=True)
+        multipliers, rows = (
+            np.asarray(forces.constraints.stage[:, 0]),
+            program.constraint.equalities,
+        )
         return Minimum(
             program=program,
             x=np.asarray(state.trajectory.u[:, 0]),

@@ -268,7 +268,7 @@ class Results:
         except DraxError:  # f is not there
             defect = float(np.nan_to_num(self.max_defect[chain], nan=np.inf))
             of_dynamics = Violation(DYNAMICS, defect, FEASIBLE, -1, -1)
-        return most_broken(self.plan.of(chain), of_dynamics)
+        return most_broken(self.problem, self.plan.of(chain), of_dynamics)
 
     @property
     def best(self) -> Trajectory:

@@ -23,6 +23,7 @@ from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.search.units import to_units
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.progress import reporting
@@ -125,7 +126,8 @@ def solve(
         with report as search.progress, said_plainly(f"the solve of {problem.name}"):
             found = search.run()
         interrupted = search.stage.place < len(search.stage.todo)
-        solution = _certified(problem, settings, seed, found, interrupted, tolerances)
+        own = search.family.problem
+        solution = _certified(own, settings, seed, found, interrupted, tolerances)
     return solution if record is None else replace(solution, recording=record.recording())
 
 
@@ -150,7 +152,8 @@ def _certified(
 ) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
     state, info = found.chains.state, found.chains.info
-    trajectories = jax.tree.map(np.asarray, state.trajectory)
+    users = to_units(problem, state.trajectory, state.multipliers, back=True)
+    trajectories, multipliers = jax.tree.map(np.asarray, users)
     gains = np.asarray(state.gains)
     if not settings.flow.preconditioner.has_gains:
         shared, own = partition(Question(settings.flow, problem), None)
@@ -163,7 +166,7 @@ def _certified(
         solver=settings,
         seed=seed,
         trajectories=trajectories,
-        multipliers=jax.tree.map(np.asarray, state.multipliers),
+        multipliers=multipliers,
         gains=gains,
         cost=np.asarray(info.cost),
         max_defect=np.asarray(info.max_defect),

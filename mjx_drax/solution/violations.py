@@ -266,14 +266,26 @@ class Violations:
         return {v.kind: v.data() for v in self.of(motion)}
 
 
-def most_broken(found: Iterable[Violation], *others: Violation) -> Violation | None:
-    """What a plan that is not feasible breaks most, relative to what feasible plans may: FEASIBLE.
+def of_plans(problem: Problem, violation: Violation) -> Violation:
+    """A constraint's violation, with what feasible plans may: `FEASIBLE` of the row's unit."""
+    at_end = violation.kind.startswith("terminal")
+    constraint = problem.terminal_constraint if at_end else problem.constraint
+    row = violation.entry + ("inequality" in violation.kind) * constraint.equalities
+    unit = 1.0 if constraint.unit is None else float(constraint.unit[row])
+    return violation._replace(allowed=FEASIBLE * unit)
+
+
+def most_broken(
+    problem: Problem, found: Iterable[Violation], *others: Violation
+) -> Violation | None:
+    """What a plan that is not feasible breaks most, relative to what feasible plans may.
 
     Args:
+        problem: with the units of its constraints.
         found: violations of the plan, of which those of equalities and inequalities count.
         others: those of the dynamics, with what is allowed there.
     """
-    broken = (v._replace(allowed=FEASIBLE) for v in found if "equality" in v.kind)
+    broken = (of_plans(problem, v) for v in found if "equality" in v.kind)
     return max([*others, *broken], key=lambda v: v.ratio, default=None)
 
 

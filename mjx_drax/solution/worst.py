@@ -15,6 +15,7 @@ from mjx_drax.solution.violations import (
     by_entry,
     entry_name,
     extents,
+    of_plans,
     words,
     worst_knots,
 )
@@ -26,7 +27,7 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
     """Violations of a chain's plan, those of the dynamics included, the worst first.
 
     Dynamics and constraints are tolerated up to what makes a plan feasible: 1e-3 of the problem's
-    `defect_unit` of a state, and 1e-3 of a constraint.
+    `defect_unit` of a state, and 1e-3 of a constraint, in its unit.
     """
     problem, plan, u, extent = _motion(solution, chain)
     off = problem.engine_defects(plan, u)
@@ -35,7 +36,7 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
     none = np.zeros(problem.dynamics.ndx)
     for violation in by_entry(problem, (plan, u), none, extent, Tolerances()):
         if "equality" in violation.kind:
-            violation = violation._replace(allowed=FEASIBLE)
+            violation = of_plans(problem, violation)
         if violation.kind != TRACKING:
             found.append(violation)
     return _sorted(found)

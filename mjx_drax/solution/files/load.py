@@ -44,6 +44,7 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Box, Stagewise, Trajectory
 from mjx_drax.search.restarts import Restarts
 from mjx_drax.search.settings import from_data
+from mjx_drax.search.units import CONSTRAINTS, with_units
 from mjx_drax.solution.files.save import ARRAYS, CHAIN, FORMAT, SUMMARY, json_digest
 from mjx_drax.solution.replay import Replays
 from mjx_drax.solution.results import Results
@@ -67,7 +68,9 @@ def load(
         else:
             _require_same(problem, summary, arrays)
             problem = _as_solved(problem, arrays)
-        solution = _solution(cls, problem, summary, arrays)
+        units = [arrays.get(f"problem.{name}.unit") for name in CONSTRAINTS]
+        own = None if units[0] is None else Stagewise(*map(jnp.asarray, units))
+        solution = _solution(cls, with_units(problem, own), summary, arrays)
         _require_consistent(solution, summary)
         return solution
     except DraxError:

@@ -172,6 +172,8 @@ def _whole(solution: Results) -> dict[str, np.ndarray]:
         "problem.t_init": problem.t_init,
         "problem.bounds": problem.bounds,
         "problem.scatter": problem.scatter,
+        "problem.constraint.unit": problem.constraint.unit,
+        "problem.terminal_constraint.unit": problem.terminal_constraint.unit,
     }
     found = {name: value for label, part in parts.items() for name, value in _flat(label, part)}
     dynamics = mjx_dynamics(problem.dynamics)
