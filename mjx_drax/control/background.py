@@ -29,7 +29,7 @@ class Background:
         self._wanted = threading.Condition()
         self._newest: tuple[np.ndarray, float] | None = None
         self._error: BaseException | None = None
-        self._open = True
+        self._open, self._told = True, False
         self._thread = threading.Thread(target=self._work, daemon=True, name="mpc")
 
     def __enter__(self) -> Background:
@@ -37,12 +37,14 @@ class Background:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Wait for the plan in the making, and end the thread."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Wait for the plan in the making, and end the thread; raise what it failed with, once."""
         with self._wanted:
             self._open = False
             self._wanted.notify()
         self._thread.join()
+        if kind is None and not self._told:
+            self._require_working()
 
     def __call__(self, x: ArrayLike, t: float) -> np.ndarray:
         """The control (nu,) at time t [s] for the state x (nx,); the thread plans from them next.
@@ -50,14 +52,18 @@ class Background:
         Raises:
             RuntimeError: planning failed; its cause is the error.
         """
-        if self._error is not None:
-            raise RuntimeError("the planner's thread has failed") from self._error
+        self._require_working()
         x = np.array(x, float)
         if np.isfinite(x).all():
             with self._wanted:
                 self._newest = x, t
                 self._wanted.notify()
         return self.policy.control(x, t)
+
+    def _require_working(self) -> None:
+        if self._error is not None:
+            self._told = True
+            raise RuntimeError("the planner's thread has failed") from self._error
 
     def _work(self) -> None:
         while True:

@@ -82,7 +82,6 @@ from mjx_drax.search.iterate import (
     evaluate,
     loop,
     partition,
-    ranking,
 )
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.warm import resumed
@@ -545,12 +544,11 @@ def _first(found: Chains, explorers: int, seed: int, polish: Polish | None) -> C
 
     The polish of explorers begins when they become keepers.
     """
-    info, chains = found.info, len(found.cost)
+    chains = len(found.cost)
     count = chains - explorers
     age = np.zeros(chains, np.int32)
     age[count:] = np.arange(explorers) * CYCLE // max(explorers, 1)
-    order = np.lexsort(ranking(info.cost, info.max_defect)[::-1])
-    state = _rows(found.state, order)
+    state = _rows(found.state, found.order()[0])
     if polish is None:
         state = replace(state, polish=())
     return Carried(

@@ -20,8 +20,10 @@ from mjx_drax.control.mpc import MPC, Statistics
 from mjx_drax.control.open_quantities import driven
 from mjx_drax.control.plant import Plant, Push, random_pushes
 from mjx_drax.physics.dynamics import mujoco_model
+from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Trajectory
 
 SETTLE = 4.0
 """Time without pushes at the end of a run [s], at least."""
@@ -179,7 +181,7 @@ class Trials:
 def _cost(policy: MPC, motion: Motion) -> float:
     """phi at the end plus the running cost at the start of every control step that was driven."""
     problem = policy.original
-    dynamics = problem.dynamics
+    problem, dynamics = problem.at_time(float(motion.times[0])), problem.dynamics
     each = round(float(dynamics.dt) / (motion.times[1] - motion.times[0]))
     x, u = np.append(motion.states[:-1:each], motion.states[-1:], axis=0), motion.controls[::each]
     if isinstance(dynamics, Extended):
@@ -187,14 +189,13 @@ def _cost(policy: MPC, motion: Motion) -> float:
         x = driven(dynamics, np.append(x, further, axis=1), u)
         phases = (len(u),) * len(dynamics.phases)
         problem = replace(problem, dynamics=replace(dynamics, phases=phases))
-    return float(jax.jit(_total)(problem, *map(jnp.asarray, (x[:-1], u, x[-1]))))
-
-
-def _total(problem: Problem, x: jax.Array, u: jax.Array, end: jax.Array) -> jax.Array:
-    row = jnp.minimum(jnp.arange(len(u)), problem.horizon)  # the last one stays
+    row = np.minimum(np.arange(len(u) + 1), problem.horizon)  # the last one stays
     data = jax.tree.map(lambda a: a[row], problem.data)
-    knots = replace(problem, horizon=len(u) - 1, data=data).knots
-    return jnp.sum(jax.vmap(problem.running_cost)(x, u, knots)) + problem.terminal_cost(end)
+    whole = replace(problem, x_init=jnp.asarray(x[0]), horizon=len(u), data=data)
+    if problem.data_at is not None:
+        whole = replace(whole, data=data_rows(problem.data_at, whole.times))
+    driven_knots = Trajectory(jnp.asarray(x[1:]), jnp.asarray(u))
+    return float(jax.jit(Problem.cost)(whole, driven_knots))
 
 
 def lines(numbers: dict[str, Any]) -> list[str]:

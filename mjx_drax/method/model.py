@@ -160,7 +160,21 @@ def linearize(
         jacobian, h = by.jacobian(defect, ndx + dynamics.nu, key)
         return Linearization(jacobian[:, :ndx], jacobian[:, ndx:], h)
 
-    return jax.vmap(stage)(*problem.stages(trajectory), trajectory.x, keys)
+    found = jax.vmap(stage)(*problem.stages(trajectory), trajectory.x, keys)
+    return _without_gaps(found) if dynamics.checked else found
+
+
+def _without_gaps(found: Linearization) -> Linearization:
+    """Derivatives of the knot before, or else of the first with any, where one has none.
+
+    MJX divides 0 by 0 in places of no width, as where a tendon begins to touch what it wraps, and
+    in float32 knots do get there.
+    """
+    rows = jnp.concatenate([found.A, found.B], axis=-1)
+    fine = jnp.isfinite(rows).all(axis=(1, 2))
+    last = jax.lax.cummax(jnp.where(fine, jnp.arange(len(fine)), -1))
+    nearest = jnp.where(last < 0, jnp.argmax(fine), last)
+    return replace(found, A=found.A[nearest], B=found.B[nearest])
 
 
 def _expand_costs(

@@ -148,13 +148,15 @@ def spread(
     Raises:
         DraxError: the trajectory has another shape; chains or scale are not positive.
     """
-    K, nx, nu = problem.horizon, problem.dynamics.nx, problem.dynamics.nu
+    K, nx, nu = problem.horizon, problem.dynamics.given_nx, problem.dynamics.nu
     if not isinstance(trajectory, Trajectory):
         raise DraxError(f"the trajectory is {shown(trajectory)}: give a Trajectory(x, u).")
     try:
         x, u = numbers(trajectory.x), numbers(trajectory.u)
     except (TypeError, ValueError) as error:
         raise DraxError(f"the trajectory is {shown(trajectory)}: give numbers.") from error
+    if x.shape == (K, problem.dynamics.nx):  # further states are found anew
+        x = x[:, :nx]
     if x.shape != (K, nx) or u.shape != (K, nu):
         raise DraxError(
             f"the trajectory has shapes {x.shape} and {u.shape}: give x ({K}, {nx}) and "
@@ -166,14 +168,17 @@ def spread(
     rng, box = np.random.default_rng(seed), problem.scatter
     half_x, half_u = (
         scale * np.asarray(high - low, float) / 2
-        for low, high in ((box.x_lower, box.x_upper), (box.u_lower, box.u_upper))
+        for low, high in (
+            (box.x_lower[..., :nx], box.x_upper[..., :nx]),
+            (box.u_lower, box.u_upper),
+        )
     )
     model = mujoco_model(problem.dynamics)
     du = half_u * _waves(rng, chains, K, nu)[:, :-1]
     if model is None:
         return _bounded(problem, x + half_x * _waves(rng, chains, K, nx)[:, 1:], u + du)
     turn = _per_dof(model, half_x, scale * np.pi) * _waves(rng, chains, K, model.nv)[:, 1:]
-    speed = np.diff(turn, axis=1, prepend=0) / float(problem.dynamics.dt)
+    speed = np.diff(turn, axis=1, prepend=0) / np.diff(_elapsed(problem))[:, None]
     act = half_x[..., model.nq + model.nv :] * _waves(rng, chains, K, model.na)[:, 1:]
     q, rest = np.split(np.broadcast_to(x, (chains, K, nx)), [model.nq], axis=-1)
     turned = [moved(model, *pair) for pair in zip(_rows(q), _rows(turn), strict=True)]
@@ -236,9 +241,10 @@ def _qpos(model: mujoco.MjModel, pose: Any) -> np.ndarray:
 
 def _through(problem: Problem, times: np.ndarray, qpos: np.ndarray) -> Trajectory:
     """The trajectory along positions (T, nq) at rising times (T,)."""
-    model, dt = _model(problem), float(problem.dynamics.dt)
-    q = np.array([interpolated(model, qpos, times, time) for time in _elapsed(problem)])
-    v = np.array([between(model, *pair) for pair in itertools.pairwise(q)]) / dt
+    model, elapsed = _model(problem), _elapsed(problem)
+    dt = np.diff(elapsed)
+    q = np.array([interpolated(model, qpos, times, time) for time in elapsed])
+    v = np.array([between(model, *pair) for pair in itertools.pairwise(q)]) / dt[:, None]
     start = np.asarray(problem.x_init, float)[: problem.dynamics.given_nx]
     act = np.broadcast_to(start[model.nq + model.nv :], (problem.horizon, model.na))
     states = np.concatenate([start[None], np.concatenate([q[1:], v, act], axis=1)])

@@ -65,7 +65,7 @@ def driven(model: mujoco.MjModel) -> np.ndarray:
 
 
 def inverse_dynamics(
-    model: mujoco.MjModel, x: np.ndarray, dt: float, rest: np.ndarray
+    model: mujoco.MjModel, x: np.ndarray, dt: float | np.ndarray, rest: np.ndarray
 ) -> np.ndarray:
     """The controls (K, nu) that the C engine's inverse dynamics finds for states x (K + 1, nx).
 
@@ -73,6 +73,7 @@ def inverse_dynamics(
                                        b = tau(q_k, v_k, (v_{k+1} - v_k) / dt) - tau(rest)
 
     The answer with the least change from rest, (nu,) or (K, nu), which stays where there is none.
+    dt is a number, or one for each stage, (K,).
     Limits of forces and controls are left out, so that tau is affine in u.
     """
     model = copy.copy(model)
@@ -80,13 +81,13 @@ def inverse_dynamics(
     model.actuator_forcelimited[:] = 0
     data = mujoco.MjData(model)
     out = np.broadcast_to(rest, (len(x) - 1, model.nu)).copy()
-    nq, nv = model.nq, model.nv
+    nq, nv, steps = model.nq, model.nv, np.broadcast_to(dt, len(out))
     for k, u in enumerate(out):
         set_state(model, data, x[k])
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         at_rest, above = (_forces(model, data, u + more) for more in (0.0, 1.0))
-        data.qacc[:] = (x[k + 1, nq : nq + nv] - x[k, nq : nq + nv]) / dt
+        data.qacc[:] = (x[k + 1, nq : nq + nv] - x[k, nq : nq + nv]) / steps[k]
         mujoco.mj_inverse(model, data)
         moment = moment_arms(model, data)
         A, b = moment.T * (above - at_rest), data.qfrc_inverse - moment.T @ at_rest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -93,7 +94,8 @@ def from_mjcf(
         terminal_equality: c(data) (m,), held at 0 at x_K.
         terminal_inequality: g(data) (m,), held <= 0 at x_K.
         dt: control step [s], a multiple of the model's timestep; by default the multiple that comes
-            closest to 0.02 s.
+            closest to 0.02 s. With a free duration only the number of physics steps between knots
+            is taken from it, by default so many that none is longer than the model's timestep.
         x_init: x_0 = [qpos, qvel, act]; by default the first keyframe, else the default pose.
         x_bounds: (lower, upper) on states, each broadcastable to (nx,).
         u_bounds: (lower, upper) on controls, each broadcastable to (nu,).
@@ -163,15 +165,15 @@ def from_mjcf(
         mj_model = copy.deepcopy(model)
     name = model_name(mj_model) if name is None else name
     require_name(name)
-    substeps = steps_between_knots(mj_model, dt)
-    dt = substeps * mj_model.opt.timestep
     phases = phases_of(horizon, knots)
+    substeps = steps_between_knots(mj_model, dt, phases)
+    dt = substeps * mj_model.opt.timestep
     if knots is not None and not phases:
         raise DraxError(
             f"knots is {shown(knots)}, and the horizon is {horizon} s: knots are for a free one, "
             "horizon=(least, most); else give dt."
         )
-    K = of_phases(phases)[0] if phases else knots_in(horizon, dt)
+    K, dt = of_phases(phases) if phases else (knots_in(horizon, dt), dt)
     x0, bounded = checked_start(mj_model, name, x_init, stops)
     contacts = affordable(mj_model, name, x0, bounded, contacts)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
@@ -237,11 +239,17 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
     return list(found)
 
 
-def steps_between_knots(model: mujoco.MjModel, dt: float | None) -> int:
-    """Physics steps in a control step of dt [s], which must be a multiple of the timestep."""
+def steps_between_knots(
+    model: mujoco.MjModel, dt: float | None, phases: tuple[tuple[float, float, int], ...] = ()
+) -> int:
+    """Physics steps in a control step of dt [s], which must be a multiple of the timestep.
+
+    Without dt, as many as make no step of free durations longer than the model's timestep.
+    """
     timestep = model.opt.timestep
     if dt is None:
-        return max(1, round(0.02 / timestep))
+        longest = max((most / count for _, most, count in phases), default=0.02)
+        return max(1, math.ceil(longest / timestep - 1e-6) if phases else round(longest / timestep))
     require_positive("dt", dt, "a positive number of seconds")
     substeps = round(dt / timestep)
     if substeps < 1 or abs(substeps * timestep - dt) > 1e-6 * dt:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -140,7 +140,7 @@ class Problem:
 
     def arithmetic(self) -> AbstractContextManager[Any]:
         """A context in which JAX keeps the problem's precision, whatever it is set to."""
-        return jax.enable_x64(True) if self.precision == 64 else nullcontext()
+        return jax.enable_x64(self.precision == 64)
 
     # Of all that `observe` computes, these four keep what their readers read
 
@@ -551,10 +551,12 @@ class Problem:
             DraxError: it does not fit.
         """
         with self.arithmetic():
-            x = vector("x_init", x_init)
-            if len(x) == self.dynamics.given_nx:
+            traced = isinstance(x_init, jax.core.Tracer)  # by what makes many problems
+            x = jnp.asarray(x_init, self.x_init.dtype) if traced else vector("x_init", x_init)
+            if x.shape == (self.dynamics.given_nx,):
                 x = jnp.concatenate([x, self.x_init[len(x) :]])
-            return checked(replace(self, x_init=x))
+            moved = replace(self, x_init=x)
+            return moved if traced else checked(moved)
 
 
 def checked(problem: Problem) -> Problem:

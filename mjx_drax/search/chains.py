@@ -153,26 +153,31 @@ def unset(like: Chains, rows: int) -> Chains:
     return replace(empty, info=worst, feasible_since=np.full(rows, -1))
 
 
-def improved(kept: Chains, found: Chains, floor: np.ndarray) -> np.ndarray:
+def improved(kept: Chains, found: Chains, floor: np.ndarray | float) -> np.ndarray:
     """Which chains became sound, or cheaper by more than `CHEAPER`, (chains,)."""
     before, after = (np.asarray(a.info.cost, float) - floor for a in (kept, found))
     cheaper = after < before - CHEAPER * np.abs(before)
     return found.sound & (cheaper | ~kept.sound)
 
 
-def finished(kept: Chains, now: Chains) -> Chains:
+def finished(kept: Chains, now: Chains, floor: float) -> Chains:
     """The chains after more polish; as they were kept where that has made them worse.
 
-    The first rows of `now` are the chains; the others are the same again.
+    The first rows of `now` are the chains; the others are the same again. Costs are measured from
+    a floor.
     """
     rows = slice(len(kept.missed))
-    cost, sound = now.cost[rows], now.sound[rows]
-    dearer = cost > kept.cost + CHEAPER * np.abs(kept.cost)
-    worse = kept.sound & (dearer | ~sound)
+    polished = Chains(
+        now.state,
+        jax.tree.map(lambda a: np.asarray(a)[rows], now.info),
+        now.feasible_since[rows],
+        now.missed[rows],
+    )
+    worse = improved(polished, kept, floor)
     source = np.arange(len(worse)) + len(worse) * ~worse
     state, info = gather((kept.state, kept.info), (now.state, now.info), source)
-    since = np.where(worse, kept.feasible_since, now.feasible_since[rows])
-    return Chains(state, info, since, np.where(worse, kept.missed, now.missed[rows]))
+    since = np.where(worse, kept.feasible_since, polished.feasible_since)
+    return Chains(state, info, since, np.where(worse, kept.missed, polished.missed))
 
 
 def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:

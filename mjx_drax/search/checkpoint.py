@@ -12,7 +12,8 @@ was left alone: the file holds all that the rest of a solve depends on, and belo
 Functions have no names that another process could compare, but the text of what they are traced to
 has no addresses in it and all constants that they refer to, and is the same in every process. The
 solve compiles what was lowered for it, so it costs no more than to print it. Goals are left out:
-they judge replays, which are made anew.
+they judge replays, which are made anew. They also choose which chains go on, so a file of another
+goal's solve may hold none that reach this one.
 
 Files are .npz, of numbers only: reading one runs no code.
 """

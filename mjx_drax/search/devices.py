@@ -42,32 +42,38 @@ def mesh_for(count: int, devices: int = 1) -> Mesh | None:
         DraxError: more devices than there are, or a number that does not divide the share; or
             chains that cannot be shared among the processes.
     """
-    present, processes = jax.local_devices(), jax.process_count()
+    processes = jax.process_count()
     if count % processes:
         raise DraxError(
             f"{count} cannot be spread evenly over {processes} processes: give a multiple."
         )
     if processes > 1:  # synchronize now: the first time they wait for half a minute at most
         multihost_utils.process_allgather(np.zeros(1))
-    count //= processes
-    if (
-        not isinstance(devices, int | np.integer)
-        or isinstance(devices, bool)
-        or not 1 <= devices <= len(present)
-    ):
+    if count % sharing(devices):
         raise DraxError(
-            f"devices is {devices!r}: give a whole number from 1 to {len(present)}, which is how "
-            f"many {present[0].platform} devices there are."
-        )
-    if count % devices:
-        raise DraxError(
-            f"{count} chains or problems cannot be spread evenly over {devices} devices: give a "
-            "multiple."
+            f"{count // processes} chains cannot be spread evenly over {devices} devices: make "
+            f"chains a multiple of {devices}."
         )
     if processes * devices == 1:
         return None
     used = [[d for d in jax.devices() if d.process_index == i][:devices] for i in range(processes)]
     return Mesh(np.array(used).ravel(), ("share",))
+
+
+def sharing(devices: int) -> int:
+    """How many devices of all processes share the work, if so many of each are there.
+
+    Raises:
+        DraxError: they are not.
+    """
+    present = jax.local_devices()
+    whole = isinstance(devices, int | np.integer) and not isinstance(devices, bool)
+    if not (whole and 1 <= devices <= len(present)):
+        raise DraxError(
+            f"devices is {devices!r}: give a whole number from 1 to {len(present)}, which is how "
+            f"many {present[0].platform} devices there are."
+        )
+    return jax.process_count() * int(devices)
 
 
 def split_over(program: Callable[..., Any], mesh: Mesh | None, *whole: Any) -> Callable[..., Any]:

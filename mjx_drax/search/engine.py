@@ -132,7 +132,7 @@ class Search:
         recorder: of a single problem's knots.
         progress: called with (iterations done, of how many, diagnostics) for a single problem.
         chunk_done: called with (problems done, of how many) after every chunk.
-        seconds: after which a single problem's search is interrupted, at a report.
+        seconds: after which this call of a single problem's search is interrupted, at a report.
     """
 
     family: Family
@@ -152,6 +152,7 @@ class Search:
     flow: Langevin = field(init=False)
     question: tuple[Question, Question] = field(init=False)
     launch: Callable[..., Any] = field(init=False)
+    started: float = field(init=False, default=0.0)
     clock: float = field(init=False, default=0.0)
     compiling: float = field(init=False, default=0.0)
 
@@ -168,7 +169,8 @@ class Search:
             self._compile_the_rest()
         self.compiling = time.perf_counter() - clock
 
-        self.clock = time.perf_counter() - before
+        self.started = time.perf_counter()
+        self.clock = self.started - before
         try:
             while not ended:
                 if self.stage.place < len(self.stage.todo):
@@ -183,6 +185,8 @@ class Search:
             answered |= self.stage.begun and not self.family.alone  # one may be half kept
         if not answered:
             self._save(ended, now=True)
+        if self.stage.begun and self.stage.rollouts == 0:  # else rollouts have judged
+            self.stage = replace(self.stage, now=self._judged(self.stage.now))
         found = self._merged() if self.stage.begun else self.stage.kept
         assert found is not None
         if self.guess is not None:
@@ -329,7 +333,17 @@ class Search:
         state = self._begun(0, knots, keys)  # which may have moved them off their bounds
         state = replace(state, trajectory=replace(knots, slack=state.trajectory.slack))
         state, info = self._iterated(state, 0, 0)
-        return self._whole(Chains.of(state, info, np.zeros(self.chains, int)))
+        return self._judged(Chains.of(state, info, np.zeros(self.chains, int)))
+
+    def _judged(self, chains: Chains) -> Chains:
+        """The chains, on one device; feasible ones that miss the goal are marked.
+
+        By plans: to replay them takes longer.
+        """
+        whole = self._whole(chains)
+        if self.family.problem.goal is None:
+            return whole
+        return replace(whole, missed=self._replayer.short(whole))
 
     def _begin_chunk(self) -> None:
         """New initial knots and random numbers for every row."""
@@ -459,7 +473,7 @@ class Search:
         )
         if self.recorder is not None:
             self.recorder.begin(continues=True)
-            self.recorder.belong(again)
+            self.recorder.belong(again, now.missed)
         self._record()
         return True
 
@@ -510,8 +524,20 @@ class Search:
 
     def _sound_costs(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
         """Costs of those problems' chains, from their floors, (len(indices), chains)."""
-        costs = chains.sound_cost.reshape(self.family.count, self.chains)[indices]
+        costs = self._costs_to_beat(chains, self.family.count)[indices]
         return costs - self.stage.floor[indices, None]
+
+    def _costs_to_beat(self, chains: Chains, problems: int) -> np.ndarray:
+        """`sound_cost` of chains, (problems, each).
+
+        In a batch many goals may be out of reach: a chain that misses counts, where all do.
+        """
+        if self.family.alone:
+            return chains.sound_cost.reshape(problems, -1)
+        feasible, missed = (a.reshape(problems, -1) for a in (chains.feasible, chains.missed))
+        arrives = (feasible & ~missed).any(axis=1, keepdims=True)
+        costs = chains.cost.reshape(problems, -1)
+        return np.where(feasible & ~(missed & arrives), costs, np.inf)
 
     def _done_up_to(self, indices: np.ndarray, now: Chains | None = None) -> np.ndarray:
         """Up to which cost, from their floors, chains of those problems are done, (n, 1).
@@ -525,7 +551,7 @@ class Search:
             costs.append(self._sound_costs(kept, indices))
             sizes.append(np.asarray(kept.info.size).reshape(-1, self.chains)[indices])
         if now is not None:
-            costs.append(now.sound_cost.reshape(n, -1) - stage.floor[indices, None])
+            costs.append(self._costs_to_beat(now, n) - stage.floor[indices, None])
             sizes.append(np.asarray(now.info.size).reshape(n, -1))
         assert self.settings.within is not None
         both = np.concatenate(costs, axis=1), np.concatenate(sizes, axis=1)
@@ -536,10 +562,10 @@ class Search:
         stage, kept, now = self.stage, self.stage.kept, self._whole(self.stage.now)
         if stage.finishing:
             assert kept is not None
-            return finished(kept, now)
+            return finished(kept, now, stage.floor[0])
         owners = self._owners(now)
         if self.recorder is not None:
-            self.recorder.belong(owners.ravel())
+            self.recorder.belong(owners.ravel(), now.missed)
         if kept is None:
             return now if owners.size == self.chains else now.at(np.flatnonzero(owners >= 0))
         if self.family.alone:
@@ -620,7 +646,7 @@ class Search:
             noise *= COOLER**self.stage.coolings
         elif attempt == 0 or not settings.heated:
             flow = replace(flow, iterations=settings.descent)
-        if attempt == 0 and isinstance(self.guess, Warm):
+        if attempt == 0 and isinstance(self.guess, Warm) and settings.after:
             flow = replace(flow, iterations=0)
         if self.family.alone:
             if settings.descent is not None:
@@ -801,17 +827,16 @@ class Search:
     def _roll_out(self) -> bool:
         """The rollouts that follow an attempt; False if they are interrupted. See `Rollouts`.
 
-        Without any, plans of a single problem tell which chains miss the goal. In a batch most
-        problems may have goals out of reach, and would be tried again for nothing.
+        Without any, plans tell which chains miss the goal.
         """
         rollouts, stage = self.settings.rollouts, self.stage
         assert rollouts is not None
         if not rollouts.asked:
-            if self.family.alone and self.family.problem.goal is not None:
-                now = self._whole(stage.now)
-                now = replace(now, missed=self._replayer.short(now))
-                costs = np.where(now.feasible, now.cost, np.inf) - stage.floor[0]
-                least = np.minimum(stage.least, costs.min())
+            if self.family.problem.goal is not None:
+                now, least = self._judged(stage.now), stage.least
+                if self.family.alone:
+                    costs = np.where(now.feasible, now.cost, np.inf) - stage.floor[0]
+                    least = np.minimum(least, costs.min())
                 self.stage = replace(stage, now=replace(stage.now, missed=now.missed), least=least)
             return True
         now = self._whole(stage.now)
@@ -938,7 +963,7 @@ class Search:
         if self.progress is not None:
             begun = done - stage.step + self.flow.iterations + self.settings.after
             self.progress(done, max(begun, done), stage.now.info)
-        if time.perf_counter() - self.clock > self.seconds:
+        if time.perf_counter() - self.started > self.seconds:
             raise KeyboardInterrupt
 
     def _record(self) -> None:
@@ -980,7 +1005,7 @@ class Search:
 
         def state() -> State:
             x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))
-            return begin(own, shared, problem.started(Trajectory(x, u)), jax.random.key(0))
+            return begin(own, shared, family.at(0).started(Trajectory(x, u)), jax.random.key(0))
 
         def size(tree: Any) -> int:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))

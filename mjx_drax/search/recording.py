@@ -71,26 +71,28 @@ class Tries:
     """One attempt: its snapshots, and which chain got what each place has found, (places,).
 
     If it `continues`, chains went on from where their best attempts had left them. `owners` is
-    empty until the attempt ends, and -1 where no chain took what was found.
+    empty until the attempt ends, and -1 where no chain took what was found; so is `missed`, which
+    says what misses the goal.
     """
 
     snapshots: list[Snapshot] = field(default_factory=list)
     continues: bool = False
     owners: np.ndarray = field(default_factory=lambda: np.array([], int))
+    missed: np.ndarray = field(default_factory=lambda: np.array([], bool))
 
-    def best(self, chain: int) -> tuple[int, tuple[bool, float]] | None:
+    def best(self, chain: int) -> tuple[int, tuple[bool, bool, float]] | None:
         """The place whose end is best among those that the chain got, and its rank.
 
-        As solves choose: feasible before infeasible, then the cheaper or the less infeasible.
-        None if it got none.
+        As `Chains.order` ranks. None if it got none.
         """
         places = np.flatnonzero(self.owners == chain)
         if not len(places):
             return None
         last = self.snapshots[-1]
         infeasible, value = ranking(last.cost, last.max_defect)
-        place = int(places[np.lexsort((value[places], infeasible[places]))[0]])
-        return place, (bool(infeasible[place]), float(value[place]))
+        ranks = [(bool(infeasible[i]), bool(self.missed[i]), float(value[i])) for i in places]
+        rank = min(ranks)
+        return int(places[ranks.index(rank)]), rank
 
 
 @dataclass(frozen=True)
@@ -168,10 +170,10 @@ class Recorder:
         """An attempt begins."""
         self.attempts.append(Tries(continues=continues))
 
-    def belong(self, owners: np.ndarray) -> None:
-        """The latest attempt's places belong to those chains, (places,)."""
+    def belong(self, owners: np.ndarray, missed: np.ndarray) -> None:
+        """The latest attempt's places belong to those chains, and some miss the goal, (places,)."""
         if self.attempts:
-            self.attempts[-1].owners = owners
+            self.attempts[-1].owners, self.attempts[-1].missed = owners, missed
 
     def take(self, problem: Problem, sigma: float, done: int, z: Trajectory, info: Info) -> None:
         """A snapshot after `done` iterations of the solve, at the noise sigma."""
@@ -198,6 +200,7 @@ class Recorder:
         return {
             "every": np.array(self.every),
             "owners": _joined(owners),
+            "missed": _joined([tries.missed for tries in self.attempts]),
             "owned": np.array([len(a) for a in owners]),
             "continues": np.array([tries.continues for tries in self.attempts]),
             "counts": np.array([len(tries.snapshots) for tries in self.attempts]),
@@ -216,10 +219,11 @@ class Recorder:
         both = zip(saved["iteration"].tolist(), saved["sigma"].tolist(), rows, strict=True)
         shots = iter([Snapshot(done, sigma, *arrays) for done, sigma, arrays in both])
         self.every = int(saved["every"])
-        parts = parted("owners", "owned"), saved["continues"].tolist(), saved["counts"].tolist()
+        ends = (parted(name, "owned") for name in ("owners", "missed"))
+        parts = saved["counts"].tolist(), saved["continues"].tolist(), *ends
         self.attempts = [
-            Tries(list(islice(shots, count)), continues, owners)
-            for owners, continues, count in zip(*parts, strict=True)
+            Tries(list(islice(shots, count)), continues, owners, missed.astype(bool))
+            for count, continues, owners, missed in zip(*parts, strict=True)
         ]
 
     def recording(self) -> Recording:

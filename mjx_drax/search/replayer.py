@@ -13,7 +13,7 @@ import numpy as np
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
 from mjx_drax.problem.trajectory import Trajectory
-from mjx_drax.search.chains import Chains, best_of, improved
+from mjx_drax.search.chains import CHEAPER, Chains, best_of, improved
 from mjx_drax.search.family import Family, Tracked
 from mjx_drax.search.iterate import (
     FEASIBLE,
@@ -27,12 +27,6 @@ from mjx_drax.search.shooting import Shots
 
 SHARES = (0.5, 0.2, 0.05)
 """Of what a round has changed, these are rolled out where all of it brings no improvement."""
-
-ALIKE = 1e-4
-"""Plans that end within this share of the largest entries of motions end alike."""
-
-SOME = 256
-"""So many plans tell how large the entries of motions are."""
 
 
 @dataclass(frozen=True)
@@ -70,20 +64,19 @@ class Replayer:
     def short(self, chains: Chains) -> np.ndarray:
         """Which feasible chains have plans that end short of the goal, (rows,).
 
-        A goal takes microseconds in Python, so plans that end alike are asked once.
+        Where all chains of one of many problems cost the same, nothing is to be chosen, and they
+        are not asked.
         """
-        missed, rows = np.zeros(len(chains.missed), bool), np.flatnonzero(chains.feasible)
-        if len(rows):
-            knots = chains.state.trajectory
-            x, starts = np.asarray(knots.x), self.family.starts(self.indices, knots)
-            ends = np.asarray(x[rows, -1], float)
-            size = np.abs(x[rows[:SOME]]).max(axis=(0, 1)) + np.finfo(float).tiny
-            weights = np.random.default_rng(0).uniform(1.0, 2.0, len(size))
-            keys = (np.round(ends / (ALIKE * size)) * weights).sum(axis=1)  # sorts sooner than rows
-            _, first, which = np.unique(keys, return_index=True, return_inverse=True)
-            few = rows[first]
-            plans = np.concatenate([starts[few, None], x[few]], axis=1)
-            missed[rows] = ~self.family.reached(self.of[few], plans)[which]
+        missed, feasible = np.zeros(len(chains.missed), bool), chains.feasible
+        asked = feasible
+        if not self.family.alone:
+            costs = (chains.cost - self.floor).reshape(-1, self.places)
+            least = costs.min(axis=1, keepdims=True)
+            alike = feasible.reshape(costs.shape) & (costs - least <= CHEAPER * np.abs(least))
+            asked = feasible & ~np.repeat(alike.all(axis=1), self.places)
+        rows = np.flatnonzero(asked)
+        plans = self._plans(chains.state.trajectory)[rows]
+        missed[rows] = ~self.family.arrive(self.of[rows], plans)
         return missed
 
     def rolled_out(

@@ -82,14 +82,15 @@ def require_alike(problem: Problem, warm: Warm) -> None:
     dynamics = problem.dynamics
     stage, end = problem.constraint, problem.terminal_constraint
     start, slack = warm.knots.start, warm.knots.slack
-    inequalities = 0 if slack is None else slack.stage.shape[-1] + slack.terminal.shape[-1]
+    slacks = (0, 0) if slack is None else (slack.stage.shape[-1], slack.terminal.shape[-1])
     for label, own, given in (
         ("free coordinates of x_0", len(problem.free), 0 if start is None else start.shape[-1]),
         ("entries of the state", dynamics.nx, warm.knots.x.shape[-1]),
         ("controls", dynamics.nu, warm.knots.u.shape[-1]),
         ("constraints of a stage", stage.rows, warm.multipliers.constraints.stage.shape[-1]),
         ("terminal constraints", end.rows, warm.multipliers.constraints.terminal.shape[-1]),
-        ("inequalities", stage.inequalities + end.inequalities, inequalities),
+        ("inequalities of a stage", stage.inequalities, slacks[0]),
+        ("terminal inequalities", end.inequalities, slacks[1]),
     ):
         if own != given:
             raise DraxError(

@@ -21,11 +21,11 @@ from mjx_drax.method.langevin import Langevin
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.checkpoint import Checkpoint
-from mjx_drax.search.devices import mesh_for
+from mjx_drax.search.devices import mesh_for, sharing
 from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
-from mjx_drax.search.iterate import FEASIBLE, ranking
+from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import (
@@ -105,12 +105,14 @@ class BatchSolution:
         return f"{certified} of {len(self.best)} problems CERTIFIED, {optimal} of them optimal"
 
     def _report(self) -> list[str]:
-        cost = self.cost[self.certified]
-        low, middle, high = np.quantile(cost, (0, 0.5, 1)) if cost.size else [np.nan] * 3
+        cost, costs = self.cost[self.certified], "of certified replays: there are none"
+        if cost.size:
+            low, middle, high = np.quantile(cost, (0, 0.5, 1))
+            costs = f"{low:.5g} to {high:.5g}, median {middle:.5g}, of certified replays"
         said = [
             f"problems       {len(self.best)} of {self.chain_cost.shape[1]} chains each: "
             f"{counts(self.status)}",
-            f"cost           {low:.5g} to {high:.5g}, median {middle:.5g}, of certified replays",
+            f"cost           {costs}",
             f"engine         {self.family.problem.dynamics.engine}",
             f"time           compile {self.compile_time:.1f} s, solve {self.solve_time:.1f} s, "
             f"replay {self.replay_time:.1f} s",
@@ -168,9 +170,14 @@ class BatchSolution:
         return statuses(self.feasible, self.optimal, ~finite, self.interrupted)
 
     def where(self, i: int) -> Violation | None:
-        """What keeps the plan of problem i from being feasible; see `Solution.where`."""
+        """What keeps problem i from being certified; None if it is.
+
+        Of a plan that is not feasible see `Solution.where`; of a feasible one, what its better
+        replay breaks most.
+        """
         if self.feasible[i]:
-            return None
+            better = self.open_loop if self.open_loop_is_better[i] else self.feedback
+            return better.violations.worst(i)
         problem, plan, u = self.family.at(i), self.x[i].astype(float), self.u[i]
         found = plan_violations(Family.of_one(problem), plan[None], u[None]).of(0)
         return most_broken(problem, found, largest_defect(problem, plan, u))
@@ -241,8 +248,10 @@ def solve_batch(
         tolerances.of(family.at(0))  # refuses those of another size
         settings = settled(family.at(0), chains, seed, solver, tolerance, max_iterations)
         file = None if checkpoint is None else Checkpoint(checkpoint)
-        size = chunk or (file and file.answered("chunk")) or fitting(family.at(0), chains)
-        size = -(-min(size, family.count) // jax.process_count()) * jax.process_count()
+        shares = sharing(devices)
+        fits = shares * fitting(family.at(0), chains)
+        size = chunk or (file and file.answered("chunk")) or fits
+        size = -(-min(size, family.count) // shares) * shares
         search = Search(
             family,
             chains,
@@ -270,8 +279,7 @@ def _certified(
     clock = time.perf_counter()
     info, shape = found.chains.info, (family.count, chains)
     cost, defect = (np.reshape(a, shape) for a in (info.cost, info.max_defect))
-    infeasible, value = ranking(cost, defect)
-    best = np.lexsort((value, infeasible), axis=1)[:, 0]
+    best = found.chains.order(family.count)[:, 0]
     state, rows = found.chains.state, np.arange(family.count) * chains + best
     x, u, gains = (
         np.asarray(a)[rows] for a in (state.trajectory.x, state.trajectory.u, state.gains)

@@ -230,6 +230,12 @@ def _advice(solution: Results) -> str:
             "chains will hardly help. Give a longer horizon, a guess of another motion, or more "
             f"weight on the terminal cost.{stops}"
         )
+    if TRACKING in broken and solution.problem.goal is None:
+        return (
+            "replays leave the plan, as where a motion is unstable or its knots are far apart: "
+            "give a smaller dt, or a goal, if it is enough to end there; tolerances.tracking says "
+            f"how far off counts.{stops}"
+        )
     return (
         "feasible chains miss the goal or break constraints when replayed. Try a guess of the "
         "motion, more chains, a higher weight on the terminal cost, or a longer horizon; "

@@ -133,7 +133,8 @@ def solve(
 
 def warm_of(solution: Solution, problem: Problem, chains: int) -> Warm:
     """The solution's chains for a solve of the same sizes, the best first, resized to `chains`."""
-    order = np.lexsort(ranking(solution.cost, solution.max_defect)[::-1])
+    infeasible, value = ranking(solution.cost, solution.max_defect)
+    order = np.lexsort((value, ~solution.certified_chains, infeasible))
     dtype, gains = problem.x_init.dtype, jnp.asarray(solution.gains)
     known = Warm(solution.trajectories, solution.multipliers, gains)
     known = jax.tree.map(lambda a: jnp.asarray(a, dtype), known)

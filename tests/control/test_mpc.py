@@ -240,6 +240,14 @@ def test_an_error_in_the_thread_reaches_the_caller(policy, monkeypatch):
     with Background(policy) as newest, pytest.raises(RuntimeError, match="thread has failed"):
         call()
 
+    def call_once():
+        with Background(policy) as newest:
+            newest([0.5, 0.0], DT)
+            time.sleep(0.05)
+
+    with pytest.raises(RuntimeError, match="thread has failed"):
+        call_once()
+
 
 @pytest.mark.parametrize(
     ("settings", "words"),
@@ -335,6 +343,32 @@ def test_a_second_run_goes_on_where_the_first_ended(slider):
     policy.reset(slider.x_init)
     assert len(loop.simulate(policy, plant, 0.1).controls) == 10
     assert len(loop.simulate(policy, plant, 0.1).controls) == 10
+
+
+@pytest.mark.parametrize("by", ["data", "time"])
+def test_what_a_run_cost_counts_its_own_times(by):
+    def off(x, *u, knot):
+        target = knot.data if by == "data" else jnp.sin(knot.time)
+        return (x[0] - target) ** 2
+
+    problem = from_function(
+        f,
+        x_init=[0.0, 0.0],
+        nu=1,
+        dt=DT,
+        horizon=5 * DT,
+        running_cost=off,
+        terminal_cost=off,
+        data=jnp.sin if by == "data" else None,
+    )
+    for begin in (0.0, 1.0):
+        times = begin + DT / 2 * np.arange(61)  # the plant takes two steps for each control
+        states = np.stack([np.sin(times), 0 * times], axis=1)
+        motion = loop.Motion(times, states, np.zeros((60, 1)), None, None, (), np.zeros((60, 0)))
+        assert loop._cost(SimpleNamespace(original=problem), motion) < 1e-9
+        motion.states[:, 0] += 0.1
+        cost = loop._cost(SimpleNamespace(original=problem), motion)
+        assert cost == pytest.approx(31 * 0.01, rel=1e-3)
 
 
 def test_ctrl_c_in_the_first_solve_ends_the_program(slider, monkeypatch):

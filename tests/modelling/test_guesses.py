@@ -247,3 +247,18 @@ def test_models_with_further_states_have_guesses_of_their_own():
     guess = guesses.waypoints(problem, [(0.1, "back")])
     assert guess.x.shape[-1] == problem.dynamics.given_nx < problem.dynamics.nx
     assert initial_knots(problem, 2, guess, None).x.shape[-1] == problem.dynamics.nx
+
+
+@pytest.mark.parametrize(
+    ("horizon", "knots"), [((0.1, 0.5), K), ([(0.05, 0.15), (0.3, 0.5)], [K // 2, K // 2])]
+)
+def test_velocities_of_a_guess_fit_its_steps_where_durations_are_free(horizon, knots):
+    problem = arm(horizon=horizon, knots=knots, dt=None)
+    guess = guesses.path(problem, np.linspace(LOW, HIGH, 50))
+    q = np.concatenate([problem.x_init[None, :2], positions(guess)])
+    moves = np.diff(q[1:], axis=0) / np.diff(problem.times[1:])[:, None]
+    close(guess.x[1:, 2:4], moves)
+    apart = guesses.spread(problem, guess, 3)
+    turns = np.asarray(apart.x[..., :2] - guess.x[:, :2])
+    speeds = np.diff(turns, axis=1) / np.diff(problem.times[1:])[:, None]
+    np.testing.assert_allclose(apart.x[:, 1:, 2:4] - guess.x[1:, 2:4], speeds, atol=2e-3)

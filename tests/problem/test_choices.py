@@ -491,3 +491,11 @@ def test_data_of_a_free_duration_stay_rows():
     )
     with pytest.raises(DraxError, match="data is a function of time, and the horizon is free"):
         problem.with_data(lambda t: jnp.stack([t]))
+
+
+def test_no_physics_step_of_a_free_duration_is_longer_than_the_models():
+    free = robot(horizon=[(0.1, 0.4), (0.2, 1.0)], knots=[5, 7], dt=None)  # timestep 0.01
+    substeps, longest = free.dynamics.inner.substeps, 1.0 / 7
+    assert longest / substeps <= 0.01 < longest / (substeps - 1)
+    assert free.dynamics.dt == pytest.approx(0.85 / 12)
+    assert robot(horizon=(0.1, 0.4), knots=5, dt=0.02).dynamics.inner.substeps == 2

@@ -527,3 +527,16 @@ def test_killed_by_the_system_at_random_moments(kills, whole, whole_batch, tmp_p
         expected = (whole.trajectories.u, whole.cost, whole_batch.u, whole_batch.chain_cost)
         for a, b in zip(found.values(), expected, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+def test_each_call_has_its_own_seconds(tmp_path):
+    once = {"chains": CHAINS, "solver": SOLVER, "checkpoint": tmp_path / "file"}
+    first = solve(PROBLEM, max_seconds=1e-9, **once)
+    assert first.interrupted
+    with np.load(once["checkpoint"]) as content:
+        arrays = dict(content)
+    arrays["solve_time"] = np.array(1e3)  # as if that call had taken long
+    np.savez(once["checkpoint"].open("wb"), **arrays)
+    second = solve(PROBLEM, max_seconds=500.0, **once)
+    assert not second.interrupted
+    assert second.solve_time > 1e3

@@ -62,6 +62,8 @@ alone, many = (
     for n in (1, 2)
 )
 np.testing.assert_array_equal(many.u, alone.u)
+three = solve_batch(lambda x: replace(problem, x_init=x), starts[:3], 2, 0, solver, devices=2)
+np.testing.assert_array_equal(three.u, alone.u[:3])
 
 def overlap(compiles):
     # How many devices work at a time.

@@ -13,7 +13,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import INF, NAN, At, arm, assert_complains, cases, cut_short, made_up, parts, robot
+from builders import (
+    INF,
+    NAN,
+    At,
+    arm,
+    assert_complains,
+    cases,
+    cut_short,
+    made_up,
+    parts,
+    point,
+    robot,
+)
 
 from mjx_drax import Solution, from_program, minimize, save_csv, save_dataset, solve, solve_batch
 from mjx_drax.solution.formats import export_keyframes
@@ -109,8 +121,8 @@ BATCHES = [
     ("make-raises", lambda at: family(fails), "make failed for value 0", "no such sensor"),
     ("make-returns-none", lambda at: family(lambda x: None), "the problem is None"),
     ("make-constant", lambda at: family(lambda x: at.point), "same problem for every value"),
-    ("make-checks-traced", lambda at: family(at.point.with_x_init),
-     "make failed when it was traced", "replace"),
+    ("make-checks-traced", lambda at: family(lambda x: point(x_init=x)),
+     "make failed when it was traced", "with_x_init"),
     ("make-branches", lambda at: family(lambda x: moved(x if x[0] > 0 else -x)),
      "make failed when it was traced"),
     ("make-other-model", lambda at: family(lambda g: robot(arm(option=f'gravity="0 0 {g[0]}"'))),

@@ -146,6 +146,15 @@ def test_the_advice_where_all_chains_miss_the_goal_at_the_same_cost():
     assert "miss the goal or break constraints" in str(others).splitlines()[-1]
 
 
+def test_the_advice_where_there_is_no_goal_and_replays_leave_the_plan():
+    made = made_up(point(goal=None))
+    off = replace(made.trajectories, x=made.trajectories.x + 0.5)
+    told = str(replace(made, trajectories=off).certify()).splitlines()[-1]
+    assert "replays leave the plan" in told
+    assert "tolerances.tracking" in told
+    assert "goal or break" not in told
+
+
 def test_the_advice_where_the_plan_lacks_a_contact(monkeypatch):
     solution = made_up(robot(goal=lambda data: False)).certify()
     told = (2, "'floor' touches 'shin'")

@@ -423,7 +423,8 @@ def test_the_worst_of_a_plan_is_relative_to_what_plans_may_break():
     of_dynamics = Violation("dynamics", 0.6, 0.2, 0, 3)  # three times what is allowed
     broken = Violation("inequality", 0.5, 0.4, 1, 2)  # less, and 500 times what a plan may
     bounds = Violation("state_bounds", 9.0, 1.0, 0, 0)
-    worst = most_broken([bounds, broken], of_dynamics)
+    two = mass(inequality=lambda x, u: jnp.zeros(2))
+    worst = most_broken(two, [bounds, broken], of_dynamics)
     assert worst == broken._replace(allowed=FEASIBLE)
-    assert most_broken([bounds], of_dynamics) is of_dynamics
-    assert most_broken([]) is None
+    assert most_broken(two, [bounds], of_dynamics) is of_dynamics
+    assert most_broken(two, []) is None

@@ -382,8 +382,9 @@ def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> 
                 f"the problem {problem.name} has {label} = {given}, the saved solution of "
                 f"{summary['task']} has {saved}: give the problem that was solved."
             )
-    start = np.asarray(problem.x_init)
-    if not np.array_equal(start, arrays["problem.x_init"].astype(start.dtype)):
+    start, solved = np.asarray(problem.x_init), arrays["problem.x_init"]
+    digits = min(start.dtype, solved.dtype, key=lambda kind: kind.itemsize)  # those of both
+    if not np.array_equal(start.astype(digits), solved.astype(digits)):
         raise DraxError(
             f"x_init of the problem {problem.name} is {np.asarray(problem.x_init).tolist()}, the "
             f"saved solution of {summary['task']} starts at {arrays['problem.x_init'].tolist()}: "
