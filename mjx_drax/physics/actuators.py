@@ -19,10 +19,12 @@ def disabled(model: mujoco.MjModel) -> np.ndarray:
     return np.array([0 <= g < 31 and bool(off >> int(g) & 1) for g in groups], bool)
 
 
-def control_ranges(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of controls, (nu,) each: the model's, or +-1 where it has none."""
+def control_ranges(model: mujoco.MjModel, without: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of controls, (nu,) each: the model's, 0 and 1 of muscles, or +-`without` any."""
     limited = model.actuator_ctrllimited.astype(bool)[:, None]
-    lower, upper = np.where(limited, model.actuator_ctrlrange, [-1.0, 1.0]).T
+    muscle = (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE)[:, None]
+    own = np.where(muscle, [0.0, 1.0], [-without, without])
+    lower, upper = np.where(limited, model.actuator_ctrlrange, own).T
     return lower, upper
 
 

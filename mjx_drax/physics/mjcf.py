@@ -16,7 +16,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, DraxWarning, require_part, require_positive, shown
-from mjx_drax.physics.actuators import inverse_dynamics, middle_control
+from mjx_drax.physics.actuators import control_ranges, inverse_dynamics, middle_control
 from mjx_drax.physics.agreement.checks import checked_start, examine, require_traceable
 from mjx_drax.physics.c_engine.states import stopped_at_once
 from mjx_drax.physics.contacts.pairs import Contacts
@@ -294,9 +294,7 @@ def _bounds(
     x_lower, x_upper = np.full(nx, -np.inf), np.full(nx, np.inf)
     where = model.jnt_qposadr[bounded]
     x_lower[where], x_upper[where] = (end[bounded] for end in free_ranges(model))
-    u_lower, u_upper = np.full(model.nu, -np.inf), np.full(model.nu, np.inf)
-    limited = model.actuator_ctrllimited.astype(bool)
-    u_lower[limited], u_upper[limited] = model.actuator_ctrlrange[limited].T
+    u_lower, u_upper = control_ranges(model, without=np.inf)
     given = box(nx, model.nu, x_bounds, u_bounds)
     quaternions = np.flatnonzero(Joints.of(model).is_quaternion)
     ends = np.asarray(given.x_lower), np.asarray(given.x_upper)

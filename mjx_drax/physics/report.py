@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
-from mjx_drax.physics.actuators import largest_moment_arms
+from mjx_drax.physics.actuators import control_ranges, largest_moment_arms
 from mjx_drax.physics.agreement.checks import Findings, checked_start, examine, require_traceable
 from mjx_drax.physics.agreement.differences import differences
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs
@@ -145,12 +145,12 @@ def _actuator(model: mujoco.MjModel, a: int) -> Report:
     of = {"joint": model.joint, "jointinparent": model.joint, "tendon": model.tendon,
           "site": model.site, "body": model.body}.get(transmission)  # fmt: skip
     named = _name(of(target), str(target)) if of else str(target)
-    limited = bool(model.actuator_ctrllimited[a])
+    ends = [float(end[a]) for end in control_ranges(model, without=np.inf)]
     return {
         "name": _name(model.actuator(a), f"actuator {a}"),
         "kind": kind,
         "drives": f"{transmission} {named}",
-        "range": model.actuator_ctrlrange[a].tolist() if limited else None,
+        "range": ends if np.isfinite(ends).all() else None,
     }
 
 

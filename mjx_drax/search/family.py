@@ -237,7 +237,8 @@ class Family:
         """
         if self.alone:
             return partition(Question(flow, self.problem, polish=polish), None)
-        each = Scale(*(np.repeat(np.asarray(s), chains) for s in (scale.cost, scale.noise)))
+        number = self.problem.x_init.dtype  # else float64 in numpy, for which JAX compiles again
+        each = Scale(*(np.repeat(np.asarray(s, number), chains) for s in vars(scale).values()))
         whole = Question(replace(flow, scale=each), self.rows(indices, chains), polish=polish)
         flags = jax.tree.map(lambda leaf: False, flow)
         of_flow = jax.tree.leaves(replace(flags, scale=Scale(True, True)))

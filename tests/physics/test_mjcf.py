@@ -162,6 +162,14 @@ def test_ranges_become_bounds():
     np.testing.assert_allclose(bounds.u_upper, [3.0, inf])
 
 
+def test_muscles_have_controls_from_0_to_1():
+    muscle = '<muscle joint="lift" force="10" lengthrange="0.1 1"{}/>'
+    three = muscle.format("") + '<motor joint="lift"/>' + muscle.format(' ctrlrange="0 0.5"')
+    bounds = problem(arm(actuator=three)).bounds
+    np.testing.assert_array_equal(bounds.u_lower, [0.0, -np.inf, 0.0])
+    np.testing.assert_array_equal(bounds.u_upper, [1.0, np.inf, 0.5])
+
+
 def test_a_joint_may_lean_on_its_stop():
     """As MuJoCo has it; without `stops` it is a bound that no plan comes to."""
     kept, leaning = problem(arm()), problem(arm(), stops=["*"])

@@ -32,6 +32,7 @@ from mjx_drax import (
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
+from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.search import restarts
 from mjx_drax.search.chains import Chains, best_of
@@ -658,3 +659,11 @@ def test_a_feasible_guess_that_an_attempt_loses_is_improved():
     solver = Restarts(noise, descent=None, attempts=1, polish=Polish(iterations=6))
     found = solve(problem, chains=4, solver=solver, guess=guess)
     assert (found.cost < 0.5 * float(problem.cost(guess))).all()
+
+
+def test_scales_of_problems_have_their_precision():
+    """Else numpy's float64, for which JAX would compile the same program once more."""
+    family = Family.of(point().with_x_init, np.zeros((2, 2)))
+    ones = Scale(np.ones(2), np.ones(2))
+    _, own = family.question(Langevin(), ones, np.arange(2), 3)
+    assert own.flow.scale.cost.dtype == own.flow.scale.noise.dtype == np.float32
