@@ -104,6 +104,7 @@ class Found:
         chains: the best of every chain, (N * chains,) rows.
         records, began: as in `Stage`; later attempts' records are of other tries for fewer chains.
         flow: the settings of the first attempt, in the first problem's scales.
+        interrupted: whether it was ended before its time.
         compile_time, solve_time: [s].
     """
 
@@ -111,6 +112,7 @@ class Found:
     records: list[tuple[int, Info]]
     began: list[tuple[int, int]]
     flow: Langevin
+    interrupted: bool
     compile_time: float
     solve_time: float
 
@@ -190,10 +192,14 @@ class Search:
         found = self._merged() if self.stage.begun else self.stage.kept
         assert found is not None
         if self.guess is not None:
-            found, _ = self._no_worse(found, self._guessed())
+            guessed = self._guessed()
+            _, better = self._no_worse(found, guessed)
+            if ended and better.any():
+                guessed = self._polished(guessed)
+            found, _ = self._no_worse(found, guessed)
         stage, solve_time = self.stage, time.perf_counter() - self.clock
         records, began = list(stage.records), list(stage.began)
-        return Found(found, records, began, first, self.compiling, solve_time)
+        return Found(found, records, began, first, not ended, self.compiling, solve_time)
 
     # Attempts and chunks
 
@@ -334,6 +340,15 @@ class Search:
         state = replace(state, trajectory=replace(knots, slack=state.trajectory.slack))
         state, info = self._iterated(state, 0, 0)
         return self._judged(Chains.of(state, info, np.zeros(self.chains, int)))
+
+    def _polished(self, guessed: Chains) -> Chains:
+        """A guess after a polish of its own, which no attempt has made of it as it is."""
+        if self.polish is None or isinstance(self.guess, Warm):
+            return guessed
+        noisy = self.flow.iterations  # after which a chain would be rolled out
+        state, info = self._iterated(guessed.state, noisy + 1, noisy + self.settings.after)
+        now = self._judged(Chains.of(state, info, guessed.feasible_since))
+        return finished(guessed, now, self.stage.floor[0])
 
     def _judged(self, chains: Chains) -> Chains:
         """The chains, on one device; feasible ones that miss the goal are marked.

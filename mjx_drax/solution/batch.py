@@ -263,8 +263,7 @@ def solve_batch(
         )
         with report as search.chunk_done, said_plainly("the solve of problems"):
             found = search.run()
-        interrupted = search.stage.place < len(search.stage.todo)
-        return _certified(search.family, settings, chains, found, interrupted, tolerances)
+        return _certified(search.family, settings, chains, found, tolerances)
 
 
 def _certified(
@@ -272,7 +271,6 @@ def _certified(
     settings: Restarts,
     chains: int,
     found: Found,
-    interrupted: bool,
     tolerances: Tolerances,
 ) -> BatchSolution:
     """The best chain of every problem, replayed."""
@@ -297,7 +295,7 @@ def _certified(
         chain_residual=np.reshape(info.residual, shape),
         tolerance=tolerance_of(settings),
         best=best,
-        interrupted=interrupted,
+        interrupted=found.interrupted,
         tolerances=tolerances,
         open_loop=open_loop,
         feedback=feedback,

@@ -249,7 +249,7 @@ def minimize(
             stalled=stalled_of(state),
             tolerance=tolerance_of(settings),
             died_at=np.asarray(state.died_at),
-            interrupted=search.stage.place < len(search.stage.todo),
+            interrupted=found.interrupted,
             history=history_of(found),
         )
 

@@ -125,9 +125,7 @@ def solve(
         )
         with report as search.progress, said_plainly(f"the solve of {problem.name}"):
             found = search.run()
-        interrupted = search.stage.place < len(search.stage.todo)
-        own = search.family.problem
-        solution = _certified(own, settings, seed, found, interrupted, tolerances)
+        solution = _certified(search.family.problem, settings, seed, found, tolerances)
     return solution if record is None else replace(solution, recording=record.recording())
 
 
@@ -148,7 +146,6 @@ def _certified(
     settings: Restarts,
     seed: int,
     found: Found,
-    interrupted: bool,
     tolerances: Tolerances,
 ) -> Solution:
     """The solution: everything on the host, every chain replayed twice."""
@@ -177,7 +174,7 @@ def _certified(
         tolerance=tolerance_of(settings),
         feasible_since=found.chains.feasible_since,
         died_at=np.asarray(state.died_at),
-        interrupted=interrupted,
+        interrupted=found.interrupted,
         plan=plan_violations(family, plan, u),
         open_loop=open_loop,
         feedback=feedback,

@@ -373,7 +373,7 @@ def test_what_a_run_cost_counts_its_own_times(by):
 
 def test_ctrl_c_in_the_first_solve_ends_the_program(slider, monkeypatch):
     policy = MPC(slider, chains=2, explorers=0, solver=FAST)
-    stopped = SimpleNamespace(run=lambda: None, stage=SimpleNamespace(place=0, todo=[0]))
+    stopped = SimpleNamespace(run=lambda: SimpleNamespace(interrupted=True))
     monkeypatch.setattr(mpc, "Search", lambda *_: stopped)
     with pytest.raises(KeyboardInterrupt):
         policy.reset(slider.x_init)

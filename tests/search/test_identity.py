@@ -24,7 +24,7 @@ from mjx_drax import (
     solve,
     solve_batch,
 )
-from mjx_drax.control.mpc import _planner
+from mjx_drax.control.planner import planner_of
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.search import iterate, sizes
@@ -325,14 +325,14 @@ def test_a_second_process_solves_alike_without_tracing(monkeypatch, keeps_progra
 @pytest.mark.slow
 def test_a_second_process_plans_alike_without_tracing(monkeypatch, keeps_programs):
     def plan():
-        _planner.cache_clear()
+        planner_of.cache_clear()
         policy = MPC(posed(running_cost=lambda x, u: u @ u), chains=2)
         return policy.reset([0.0, 0.0]).u
 
     first = plan()
     monkeypatch.setattr(compiled, "traced", property(traced))
     np.testing.assert_array_equal(first, plan())
-    _planner.cache_clear()
+    planner_of.cache_clear()
 
 
 ALONE = """

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from builders import DT, K, double_integrator, fastest
 
-from mjx_drax import DraxError, Polish, Restarts, Trajectory, solve
+from mjx_drax import DraxError, Polish, Restarts, Trajectory, from_function, solve
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.warm import require_alike
 from mjx_drax.solution.solve import warm_of
@@ -97,3 +97,34 @@ def test_the_step_of_a_guess_is_the_step_of_its_first_knot():
     for start, words in (([1.0, 2.0], "give 1 finite numbers"), ([np.nan], "give 1 finite")):
         with pytest.raises(DraxError, match=words):
             initial_knots(problem, 2, Trajectory(x, np.ones((5, 1)), start=start), None)
+
+
+@pytest.mark.slow
+def test_a_guess_that_is_better_than_what_is_found_is_polished():
+    def problem(**scatter):  # a point that must pass a moving disc, ahead of it or behind
+        def step(x, u, knot):
+            return x + knot.dt * u[1] * jnp.stack([jnp.cos(u[0]), jnp.sin(u[0])])
+
+        def inside(x, u, knot):
+            disc = jnp.stack([0.8, 0.5 * knot.time - 0.6])
+            return 0.09 - jnp.sum((x - disc) ** 2, keepdims=True)
+
+        return from_function(
+            step,
+            x_init=np.zeros(2),
+            nu=2,
+            horizon=(0.5, 6.0),
+            knots=40,
+            running_cost=lambda x, u, knot: knot.dt,
+            terminal_equality=lambda x: x - jnp.array([2.0, 0.0]),
+            inequality=inside,
+            u_bounds=([-3.2, 0.0], [3.2, 1.0]),
+            **scatter,
+        )
+
+    ahead = solve(problem(u_scatter=([-1.0, 0.5], [1.0, 1.0])), chains=12, progress=False)
+    behind = solve(problem(), chains=2, progress=False)
+    assert behind.replay_cost.min() > 1.05 * ahead.replay_cost.min()
+    found = solve(problem(), chains=2, guess=ahead.best, progress=False)
+    assert found.optimal
+    assert found.replay_cost.max() == pytest.approx(ahead.replay_cost.min(), rel=1e-3)
