@@ -22,7 +22,7 @@ from jax import Array
 
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.schedules import Weights
-from mjx_drax.problem.differentiators import Differentiator
+from mjx_drax.problem.differentiators import Differentiator, without_gaps
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Knot, Stagewise, Trajectory, Values
 
@@ -150,31 +150,18 @@ def linearize(
     dynamics = problem.dynamics
     ndx, by = dynamics.ndx, dynamics.step_differentiator(by)
 
-    def stage(x: Array, u: Array, knot: Knot, x_next: Array, key: Array) -> Linearization:
+    def stage(x: Array, u: Array, knot: Knot, x_next: Array, key: Array) -> tuple[Array, Array]:
         f = dynamics.at(knot).step
 
         def defect(dz: Array) -> Array:
             moved = dynamics.integrate(x, dz[:ndx])
             return dynamics.difference(f(moved, u + dz[ndx:]), x_next)
 
-        jacobian, h = by.jacobian(defect, ndx + dynamics.nu, key)
-        return Linearization(jacobian[:, :ndx], jacobian[:, ndx:], h)
+        return by.jacobian(defect, ndx + dynamics.nu, key)
 
-    found = jax.vmap(stage)(*problem.stages(trajectory), trajectory.x, keys)
-    return _without_gaps(found) if dynamics.checked else found
-
-
-def _without_gaps(found: Linearization) -> Linearization:
-    """Derivatives of the knot before, or else of the first with any, where one has none.
-
-    MJX divides 0 by 0 in places of no width, as where a tendon begins to touch what it wraps, and
-    in float32 knots do get there.
-    """
-    rows = jnp.concatenate([found.A, found.B], axis=-1)
-    fine = jnp.isfinite(rows).all(axis=(1, 2))
-    last = jax.lax.cummax(jnp.where(fine, jnp.arange(len(fine)), -1))
-    nearest = jnp.where(last < 0, jnp.argmax(fine), last)
-    return replace(found, A=found.A[nearest], B=found.B[nearest])
+    J, h = jax.vmap(stage)(*problem.stages(trajectory), trajectory.x, keys)
+    J = without_gaps(J) if dynamics.checked else J
+    return Linearization(J[:, :, :ndx], J[:, :, ndx:], h)
 
 
 def _expand_costs(

@@ -80,6 +80,17 @@ class InScalars:
         return scalarized(lambda: self.by.hessian(function, size), outermost=True)()
 
 
+def without_gaps(jacobians: Array) -> Array:
+    """Jacobians of knots (K, m, n); where one is not finite, that of the knot before.
+
+    At the beginning that of the first knot that has one. MJX divides 0 by 0 in places of no width,
+    as where a tendon begins to touch what it wraps, and in float32 knots do get there.
+    """
+    fine = jnp.isfinite(jacobians).all(axis=(1, 2))
+    last = jax.lax.cummax(jnp.where(fine, jnp.arange(len(fine)), -1))
+    return jacobians[jnp.where(last < 0, jnp.argmax(fine), last)]
+
+
 @register_dataclass
 @dataclass(frozen=True)
 class Smoothed:

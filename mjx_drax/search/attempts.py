@@ -77,8 +77,8 @@ class AttemptSoFar:
     def waited_for(self) -> np.ndarray:
         """Active places that matter, (places,).
 
-        Not those that are far too expensive, if they start again in another attempt, or need not be
-        done.
+        Those that are far too expensive are not, if another attempt will start them again, or if
+        enough others are done.
         """
         some = self.explores or self.missing(self.hopeful) > 0.0
         return self.active & self.hopeful if some else self.active

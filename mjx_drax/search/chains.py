@@ -94,8 +94,8 @@ class Stage:
         place: how many of them are done; the chunk is what follows.
         begun: whether `now` belongs to this chunk; else it has not begun.
         kept: the best so far of all chains of all problems, (N * chains,); None before any.
-        least: the least cost of feasible plans from its floor, those included that miss the goal,
-            (N,); infinite where plans are not asked. Noise of attempts has its scale.
+        least: the least cost, from its floor, of any feasible plan, even one that misses the goal,
+            (N,); infinite where the goal is not asked. It sets the noise of heated attempts.
         now: where the chunk's chains are, (rows,).
         before: `now.sound_cost` when it was asked last whether to wait, (rows,).
         damping: of each row between rollouts, (rows,); inf for rows that they cannot improve.

@@ -428,10 +428,11 @@ class Search:
     def _next_attempt(self) -> bool:
         """Go on to another attempt, or finish; False if nothing more is to be done.
 
-        If attempts are `heated`, the second one is, and later ones of a single problem are if
-        that has brought more chains, or if all are asked for. None: for a single problem they take
-        turns until one has made a chain done; then the kind goes on that has brought more.
-        In a batch, where answers must not depend on others, all are, or none.
+        With `heated=True` the second attempt has noise, and so have later ones at a single problem
+        if noise has brought more chains, or if all attempts are asked for. With `heated=None`
+        attempts at a single problem are with and without noise in turns until one has made a chain
+        done; from then on they are of the kind that has brought more. In a batch, where answers
+        must not depend on others, all have noise, or none.
         """
         stage, settings, family = self.stage, self.settings, self.family
         kept, everyone = stage.kept, np.arange(family.count)
@@ -464,7 +465,7 @@ class Search:
         return True
 
     def _begin_to_finish(self) -> bool:
-        """Polish on what is kept and was left early; False if there is nothing."""
+        """Continue the polish of kept chains that were stopped early; False if there are none."""
         stage, kept = self.stage, self.stage.kept
         if not self._ends_early:
             return False

@@ -90,7 +90,8 @@ class Tries:
             return None
         last = self.snapshots[-1]
         infeasible, value = ranking(last.cost, last.max_defect)
-        ranks = [(bool(infeasible[i]), bool(self.missed[i]), float(value[i])) for i in places]
+        missed = self.missed if len(self.missed) else np.zeros(len(value), bool)
+        ranks = [(bool(infeasible[i]), bool(missed[i]), float(value[i])) for i in places]
         rank = min(ranks)
         return int(places[ranks.index(rank)]), rank
 

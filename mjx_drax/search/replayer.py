@@ -192,8 +192,9 @@ class Replayer:
     ) -> Chains:
         """Chains whose knots are rollouts (n, K + 1, nx) of `rows`, some of which have missed.
 
-        The others are infinitely bad: answers must not depend on neighbours in a batch. What costs
-        no less than the sound chains `kept` is not judged by the engine, as it will not be taken.
+        All other rows get infinitely bad diagnostics, so that answers do not depend on neighbours
+        in a batch. The engine does not judge a rollout that costs no less than the sound chain
+        `kept`: that one would not be replaced.
         """
         knots = chains.state.trajectory
         x, u, late = np.array(knots.x), np.array(knots.u), np.ones(len(self.floor), bool)

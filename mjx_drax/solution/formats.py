@@ -131,11 +131,11 @@ def save_dataset(
 
     One group a solution, `000_NAME`, with n trajectories of K knots: times (K+1,), or (n, K+1)
     where durations are free; states (n, K+1, nx) and controls (n, K, nu) as replayed, float64;
-    plan_states, plan_controls and gains (n, K, nu, ndx), float32; mode (n,), `open loop` or `with
-    feedback`, whichever succeeds and is cheaper; and of that replay max_deviation, final_deviation,
-    max_violation, replay_cost and success, (n,) each; chain, cost, max_defect and residual of the
-    plan, feasible, optimal. Attributes: problem, engine, seed, dt, state_names, control_names; of
-    the file: format, mjx_drax.
+    plan_states, plan_controls and gains (n, K, nu, ndx), in the solve's precision; mode (n,),
+    `open loop` or `with feedback`, whichever succeeds and is cheaper; and of that replay
+    max_deviation, final_deviation, max_violation, replay_cost and success, (n,) each; chain, cost,
+    max_defect and residual of the plan, feasible, optimal. Attributes: problem, engine, seed, dt,
+    state_names, control_names; of the file: format, mjx_drax.
 
     Args:
         solutions: one, or several, from `solve` or `Solution.load`.

@@ -58,7 +58,7 @@ SAME_COST = 1e-4
 """Share of a cost by which another one counts as the same."""
 
 RESIDUAL = 1e-4
-"""Residual below which a chain counts as optimal that was not polished."""
+"""The tolerance that is shown where nothing was polished: then no residual is known."""
 
 
 @dataclass(frozen=True, eq=False)

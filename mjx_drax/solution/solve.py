@@ -62,7 +62,7 @@ def solve(
             A solution, of this problem or of one with other numbers, is a warm start: its chains
             go on from their knots, multipliers and barriers, at first without noise. Another
             horizon cuts it off, or repeats its last stage. No chain ends worse than a feasible
-            guess.
+            guess that reaches the goal.
         progress: True shows a bar, also while it compiles, False shows nothing; by default there is
             one if standard error is a terminal or a notebook, and else a line a minute, as in the
             log of a job. A function is called instead with (iterations done, of how many,

@@ -12,7 +12,6 @@ import pytest
 
 from mjx_drax import Constant, DraxError, GaussNewton, Geometric, Identity, Langevin, LogBarrier
 from mjx_drax.method.bounds import Projection, Reflection
-from mjx_drax.method.model import Linearization, _without_gaps
 from mjx_drax.problem.trajectory import Trajectory, box
 from mjx_drax.search.iterate import advance, start
 from mjx_drax.solution.program import from_program, minimize
@@ -158,22 +157,3 @@ def test_reflection_takes_a_variable_that_is_fixed():
     sides = box(0, 1, None, (0.5, 0.5))
     knots = Trajectory(jnp.zeros((1, 0)), jnp.full((1, 1), 0.7))
     assert Reflection().confine(sides, knots, knots).u[0, 0] == 0.5
-
-
-def test_a_knot_without_derivatives_of_f_takes_those_of_the_knot_before():
-    A = jnp.arange(5.0)[:, None, None] * jnp.ones((5, 2, 2))
-    B = jnp.arange(5.0)[:, None, None] * jnp.ones((5, 2, 1))
-    h = jnp.zeros((5, 2))
-    for bad, expected in (
-        ([], [0, 1, 2, 3, 4]),
-        ([2, 3], [0, 1, 1, 1, 4]),
-        ([0, 1], [2, 2, 2, 3, 4]),
-        ([0, 4], [1, 1, 2, 3, 3]),
-    ):
-        for part in (0, 1):
-            given = [A, B]
-            given[part] = given[part].at[jnp.array(bad, int), 1, 0].set(jnp.nan)
-            found = _without_gaps(Linearization(*given, h))
-            np.testing.assert_array_equal(found.A, A[jnp.array(expected)])
-            np.testing.assert_array_equal(found.B, B[jnp.array(expected)])
-    assert jnp.isnan(_without_gaps(Linearization(jnp.nan * A, B, h)).A).all()  # it is told of

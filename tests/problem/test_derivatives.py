@@ -1,6 +1,6 @@
 """Derivatives from samples against exact ones, and solves that see function values only."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,13 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import norm
 
 from mjx_drax import Constant, GaussNewton, Geometric, Identity, Langevin, from_function, solve
+from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.bounds import LogBarrier
-from mjx_drax.method.model import Multipliers, expand
+from mjx_drax.method.model import Multipliers, expand, linearize
 from mjx_drax.method.schedules import Weights
-from mjx_drax.problem.differentiators import Autodiff, Smoothed
+from mjx_drax.problem.cost import as_partial
+from mjx_drax.problem.differentiators import Autodiff, Smoothed, without_gaps
+from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
 N, M = 8, 5
@@ -202,3 +205,46 @@ def test_dynamics_without_a_useful_derivative_are_solved():
     assert found.feasible.all(), found.max_defect
     assert found.certified
     assert found.cost.max() < 0.1 * problem.cost(rest), found.cost
+
+
+@pytest.mark.parametrize(
+    ("bad", "expected"),
+    [
+        ([], [0, 1, 2, 3, 4]),
+        ([2, 3], [0, 1, 1, 1, 4]),
+        ([0, 1], [2, 2, 2, 3, 4]),
+        ([0, 4], [1, 1, 2, 3, 3]),
+    ],
+)
+def test_a_knot_without_a_derivative_takes_that_of_the_knot_before(bad, expected):
+    J = jnp.arange(5.0)[:, None, None] * jnp.ones((5, 2, 3))
+    found = without_gaps(J.at[jnp.array(bad, int), 1, 0].set(jnp.nan))
+    np.testing.assert_array_equal(found, J[jnp.array(expected)])
+
+
+def test_where_no_knot_has_a_derivative_none_is_made_up():
+    assert jnp.isnan(without_gaps(jnp.full((5, 2, 3), jnp.nan))).all()
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Tried(FunctionDynamics):
+    """As dynamics of a model, whose derivatives `check` compares."""
+
+    checked = True
+
+
+@pytest.mark.parametrize(("kind", "whole"), [(Tried, True), (FunctionDynamics, False)])
+def test_only_models_pass_over_a_knot_without_a_derivative(kind, whole):
+    def step(x, u):  # has none at u = 0.5
+        return x + 0.1 * u + 0.0 * jnp.sqrt(jnp.abs(u - 0.5))
+
+    problem = from_function(
+        step, x_init=[0.0], nu=1, dt=0.1, horizon=0.3, running_cost=lambda x, u: u @ u
+    )
+    problem = replace(problem, dynamics=kind(as_partial(step), 0.1, 1, 1))
+    knots = Trajectory(jnp.zeros((3, 1)), jnp.array([[0.2], [0.5], [0.1]]))
+    found = linearize(problem, knots, Autodiff(), jax.random.split(jax.random.key(0), 3))
+    assert jnp.isfinite(found.h).all()
+    assert bool(jnp.isfinite(found.B).all()) == whole
+    np.testing.assert_allclose(found.B[jnp.array([0, 2]), 0, 0], 0.1, rtol=1e-5)
