@@ -263,7 +263,7 @@ class Problem:
     def worst(self, values: Values, x: Array) -> Array:
         """max|h| of values that are known, at states x (K, nx), scalar.
 
-        Defects of the dynamics are measured in `defect_unit`, constraints as the user has them;
+        Defects of the dynamics are measured in `defect_unit`, constraints in their units;
         inequalities count where positive.
         """
         defect = jnp.abs(values.defects / self.defect_unit(x)).max(initial=0.0)

@@ -253,6 +253,8 @@ class Family:
 
     def in_units(self, units: Stagewise | None) -> Family:
         """The same problems with all their constraints measured in these units."""
+        if units is None and self.problem.constraint.unit is None:
+            return self
         tree = jax.tree.structure(self.problem)
         flags = jax.tree.unflatten(tree, self.differs)
         shared: Any = jax.tree.map(lambda _: False, units)

@@ -234,10 +234,8 @@ def minimize(
             found = search.run()
         program, state, info = search.family.problem, found.chains.state, found.chains.info
         _, forces = to_units(program, state.trajectory, state.multipliers, back=True)
-        multipliers, rows = (
-            np.asarray(forces.constraints.stage[:, 0]),
-            program.constraint.equalities,
-        )
+        multipliers = np.asarray(forces.constraints.stage[:, 0])
+        rows = program.constraint.equalities
         return Minimum(
             program=program,
             x=np.asarray(state.trajectory.u[:, 0]),
