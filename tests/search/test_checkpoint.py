@@ -440,7 +440,7 @@ def test_a_checkpoint_of_another_version_is_refused(written, tmp_path, monkeypat
     with pytest.raises(DraxError, match=r"version.mjx-drax .*, and this solve has .* 9.9"):
         solved(checkpoint=written)
     monkeypatch.setattr(checkpoint, "FORMAT", 9)
-    with pytest.raises(DraxError, match="is a checkpoint of format 6, and this version"):
+    with pytest.raises(DraxError, match="is a checkpoint of format 7, and this version"):
         solved(checkpoint=written)
 
 
