@@ -20,7 +20,7 @@ def disabled(model: mujoco.MjModel) -> np.ndarray:
 
 
 def control_ranges(model: mujoco.MjModel, without: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of controls, (nu,) each: the model's, 0 and 1 of muscles, or +-`without` any."""
+    """Ends of controls, (nu,) each: the model's, 0 and 1 of muscles, +-`without` of others."""
     limited = model.actuator_ctrllimited.astype(bool)[:, None]
     muscle = (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE)[:, None]
     own = np.where(muscle, [0.0, 1.0], [-without, without])

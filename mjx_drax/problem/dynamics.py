@@ -39,7 +39,8 @@ class Dynamics:
         constraint_rows: rows that a step solves constraint forces for.
         state_damping: damping of states beside that of controls in `GaussNewton`.
         twice: whether the polish differentiates f twice; else it learns what curvature f has.
-        checked: f has been tried where it was made, and need not be traced once more.
+        checked: f has been tried where it was made, and need not be traced once more; a knot where
+            it has no derivative is passed over (`without_gaps`).
         phases: numbers of knots of the phases of free duration; () where dt is fixed.
         x_names, u_names: of the entries of states and controls, for tables, plots and errors, such
             as "angle [rad]"; without them x0, x1, ... and u0, u1, ...

@@ -72,7 +72,7 @@ class Replayer:
         if not self.family.alone:
             costs = (chains.cost - self.floor).reshape(-1, self.places)
             least = costs.min(axis=1, keepdims=True)
-            alike = feasible.reshape(costs.shape) & (costs - least <= CHEAPER * np.abs(least))
+            alike = feasible.reshape(costs.shape) & (costs <= least + CHEAPER * np.abs(least))
             asked = feasible & ~np.repeat(alike.all(axis=1), self.places)
         rows = np.flatnonzero(asked)
         plans = self._plans(chains.state.trajectory)[rows]

@@ -1,4 +1,4 @@
-"""In what a solve measures a problem's constraints, so that their units matter little.
+"""Scaling of constraints: what a solve measures each row in, so that its unit matters little.
 
 The noise's penalty mu |h|^2 adds constraints to defects that are measured in parts of a box, and a
 plan is feasible if both are below one number. So a row that changes by c where a knot moves by such
@@ -87,11 +87,12 @@ def _changes(problem: Problem, knots: Trajectory) -> Stagewise:
     keys = jax.random.split(jax.random.key(0), (len(knots.u), MOVES))
     found = jax.vmap(jax.vmap(of_move, (None, 0)))(knots, keys)
 
-    def usual(changes: Array) -> Array:
+    def root_mean_square(changes: Array) -> Array:
         finite = jnp.where(jnp.isfinite(changes), jnp.square(changes), jnp.nan)
         return jnp.sqrt(jnp.nanmean(finite, axis=(0, 1)))
 
-    return Stagewise(jnp.nanmax(usual(found.stage), axis=0), usual(found.terminal))
+    of_knots = root_mean_square(found.stage)
+    return Stagewise(jnp.nanmax(of_knots, axis=0), root_mean_square(found.terminal))
 
 
 def with_units(problem: Problem, units: Stagewise | None) -> Problem:

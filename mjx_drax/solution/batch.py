@@ -249,7 +249,7 @@ def solve_batch(
         settings = settled(family.at(0), chains, seed, solver, tolerance, max_iterations)
         file = None if checkpoint is None else Checkpoint(checkpoint)
         shares = sharing(devices)
-        fits = shares * fitting(family.at(0), chains)
+        fits = fitting(family.at(0), chains, shares)
         size = chunk or (file and file.answered("chunk")) or fits
         size = -(-min(size, family.count) // shares) * shares
         search = Search(
@@ -305,12 +305,15 @@ def _certified(
     )
 
 
-def fitting(problem: Problem, chains: int) -> int:
-    """How many problems may be solved at a time, for the memory that is free now."""
+def fitting(problem: Problem, chains: int, devices: int = 1) -> int:
+    """How many problems may be solved at a time, for the memory that is free now.
+
+    GPUs have memory of their own each; devices of a CPU share it.
+    """
     device = jax.local_devices()[0]
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
-        free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+        free = devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))
     else:
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     width = problem.dynamics.ndx + problem.dynamics.nu

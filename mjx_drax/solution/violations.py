@@ -266,7 +266,7 @@ class Violations:
         return {v.kind: v.data() for v in self.of(motion)}
 
 
-def of_plans(problem: Problem, violation: Violation) -> Violation:
+def with_plan_tolerance(problem: Problem, violation: Violation) -> Violation:
     """A constraint's violation, with what feasible plans may: `FEASIBLE` of the row's unit."""
     at_end = violation.kind.startswith("terminal")
     constraint = problem.terminal_constraint if at_end else problem.constraint
@@ -285,7 +285,7 @@ def most_broken(
         found: violations of the plan, of which those of equalities and inequalities count.
         others: those of the dynamics, with what is allowed there.
     """
-    broken = (of_plans(problem, v) for v in found if "equality" in v.kind)
+    broken = (with_plan_tolerance(problem, v) for v in found if "equality" in v.kind)
     return max([*others, *broken], key=lambda v: v.ratio, default=None)
 
 

@@ -15,7 +15,7 @@ from mjx_drax.solution.violations import (
     by_entry,
     entry_name,
     extents,
-    of_plans,
+    with_plan_tolerance,
     words,
     worst_knots,
 )
@@ -36,7 +36,7 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
     none = np.zeros(problem.dynamics.ndx)
     for violation in by_entry(problem, (plan, u), none, extent, Tolerances()):
         if "equality" in violation.kind:
-            violation = of_plans(problem, violation)
+            violation = with_plan_tolerance(problem, violation)
         if violation.kind != TRACKING:
             found.append(violation)
     return _sorted(found)

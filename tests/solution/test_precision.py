@@ -160,15 +160,19 @@ def test_the_command_makes_the_problem_in_float64(tmp_path, capsys):
     assert jnp.zeros(()).dtype == jnp.float32
 
 
-def test_32_bits_are_32_bits_whatever_jax_is_set_to():
-    problem = from_function(
+def integrator(x_init):
+    return from_function(
         lambda x, u: x + 0.1 * u,
-        x_init=[1.0],
+        x_init=[x_init],
         nu=1,
         dt=0.1,
         horizon=0.5,
         running_cost=lambda x, u: x @ x + u @ u,
     )
+
+
+def test_32_bits_are_32_bits_whatever_jax_is_set_to():
+    problem = integrator(1.0)
     with jax.enable_x64(True):
         found = solve(problem, chains=2, solver=ONCE, progress=False)
     assert found.optimal
@@ -176,16 +180,6 @@ def test_32_bits_are_32_bits_whatever_jax_is_set_to():
 
 
 def test_a_file_in_float32_belongs_to_the_same_problem_in_float64(tmp_path):
-    def made():
-        return from_function(
-            lambda x, u: x + 0.1 * u,
-            x_init=[0.1],
-            nu=1,
-            dt=0.1,
-            horizon=0.5,
-            running_cost=lambda x, u: x @ x + u @ u,
-        )
-
-    solve(made(), chains=2, solver=ONCE, progress=False).save(tmp_path)
+    solve(integrator(0.1), chains=2, solver=ONCE, progress=False).save(tmp_path)
     with jax.enable_x64(True):
-        assert Solution.load(tmp_path, made()).certified
+        assert Solution.load(tmp_path, integrator(0.1)).certified
