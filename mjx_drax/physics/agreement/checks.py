@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,7 +30,7 @@ from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.actuators import control_ranges, disabled
 from mjx_drax.physics.agreement.differences import PARTS, Change, differences, disabling, set_aside
 from mjx_drax.physics.c_engine.states import Engine, integrate, quiet, set_state, stopped_at_once
-from mjx_drax.physics.contacts.collision import corners, hulls_of_one_size
+from mjx_drax.physics.contacts.collision import hulls_of_one_size
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name, touching
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE, Joints
@@ -52,11 +51,6 @@ WORST, WRONG, NOTICEABLE = 1e-1, 1e-2, 1e-6
 """One-step errors of velocities [rad/s, m/s] above which a model is refused, if there is one such
 state, or if most states are so, or is warned of. Here and there a body lies on another with one
 contact more in the C engine, and the certificate says whether that matters."""
-
-PADDED = 1e8
-"""Pairs of geoms x largest number of corners squared, below which hulls are padded to one size.
-With a Panda's 5.5e7 its steps compile in 11 and run in 19 s; as in a plan they take 27 and 1 s, and
-9 s more to trace."""
 
 MOMENTS = (0.05, 0.2, 0.6)
 """Times [s] of the states that the engines are compared at, along a motion from x_init."""
@@ -324,10 +318,7 @@ def compare(
     """
     engine, joints, nv = Engine(model, contacts), Joints.of(model), model.nv
     ndx = 2 * nv + model.na
-    pairs = touching(model, contacts)
-    largest = max((corners(model, g) for pair in pairs for g in pair), default=0)
-    as_one = hulls_of_one_size() if len(pairs) * largest**2 < PADDED else nullcontext()
-    with jax.enable_x64(True), as_one:
+    with jax.enable_x64(True), hulls_of_one_size():
         on_device = put_model(model, contacts, bounded)
 
         def reached(model: mjx.Model, x: Array, u: Array) -> Array:

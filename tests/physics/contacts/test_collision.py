@@ -16,6 +16,7 @@ from mjx_drax.physics.contacts.collision import (
     collision,
     extended,
     hull_of,
+    hulls_of_one_size,
     make_data,
     plane_box,
 )
@@ -378,6 +379,26 @@ def test_capsules_at_any_angle_slide_as_in_the_c_engine():
         mujoco.mj_resetData(model, wanted)  # upright: any direction is as good, and finite
         assert np.isfinite(find(wanted).frame).all()
     assert steep > 5
+
+
+def test_pairs_one_by_one_touch_as_all_at_once():
+    spec = mujoco.MjSpec()
+    for x, turn in ((0.0, 0.0), (0.19, 0.3), (0.4, 0.0), (1.5, 0.0)):  # on each other, far away
+        body = spec.worldbody.add_body(pos=[x, 0.0, 0.0], quat=[1.0, 0.0, turn, 0.0])
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1] * 3, margin=0.05)
+    with jax.enable_x64(True):
+        model = put_model(spec.compile())
+        data = mjx.kinematics(model, make_data(model))
+        at_once = jax.jit(lambda: collision(model, data)._impl.contact)()
+        with hulls_of_one_size():
+            one_by_one = jax.jit(lambda: collision(model, data)._impl.contact)()
+    near = np.asarray(at_once.dist) < 0.05
+    assert {tuple(pair) for pair in np.asarray(at_once.geom)[near].tolist()} == {(0, 1), (1, 2)}
+    assert np.array_equal(near, np.asarray(one_by_one.dist) < 0.05)
+    for name in ("dist", "pos", "frame"):
+        one, other = (np.asarray(getattr(found, name))[near] for found in (at_once, one_by_one))
+        assert np.allclose(one, other, atol=1e-12)
 
 
 @pytest.mark.slow
