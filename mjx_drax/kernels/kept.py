@@ -40,9 +40,13 @@ class CannotBeKept(Exception):
 
 
 def folder() -> Path | None:
-    """Where programs are kept, below the folder of JAX's cache; None if it has none on a disk."""
+    """Where programs are kept, below the folder of JAX's cache; None if it has none on a disk.
+
+    Also while another thread has something `unknown_to_jax`.
+    """
     known = jax.config.values
-    if not (known[ENABLED] and known[FOLDER]) or "://" in known[FOLDER]:
+    enabled = known[ENABLED] or _compiling[0] > 0
+    if not (enabled and known[FOLDER]) or "://" in known[FOLDER]:
         return None
     return Path(known[FOLDER]) / "programs"
 

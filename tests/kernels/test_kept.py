@@ -7,6 +7,7 @@ import pytest
 
 from mjx_drax.kernels import kept
 from mjx_drax.kernels.compilation import compiled
+from mjx_drax.kernels.kept import folder
 
 pytestmark = pytest.mark.usefixtures("keeps_programs")
 
@@ -32,6 +33,21 @@ def test_a_second_process_does_not_trace():
     np.testing.assert_array_equal(again(X, 4)["y"], [0.0, 8.0, 16.0])  # and the usual way
     assert first.keys() == again(X, 3).keys()
     assert again._cache_size() == 1
+
+
+def test_programs_have_their_place_while_another_one_compiles(tmp_path):
+    names = kept.ENABLED, kept.FOLDER
+    before = [jax.config.values[name] for name in names]
+    try:
+        jax.config.update(kept.ENABLED, True)
+        jax.config.update(kept.FOLDER, str(tmp_path))
+        with kept.unknown_to_jax():
+            assert folder() == tmp_path / "programs"
+        jax.config.update(kept.ENABLED, False)
+        assert folder() is None
+    finally:
+        for name, value in zip(names, before, strict=True):
+            jax.config.update(name, value)
 
 
 @pytest.mark.parametrize(
