@@ -69,6 +69,8 @@ MOVE, DIRECTIONS = 1e-2, 16
 """Share of the extent by which knots are moved to see how constraints change, and how often."""
 
 Tolerance = float | Sequence[float] | None
+Limits = tuple[tuple[Array, ...], Array, Array]
+"""Tolerances of each kind in `MEASURED`, the relative one, and `STILL`."""
 
 
 @dataclass(frozen=True)
@@ -305,24 +307,33 @@ def warn_of_loose_ends(
 ) -> None:
     """Warn of constraints at the end that tolerate much of what x_init lacks.
 
+    That is where all entries of a kind do, or where one does whose tolerance is no share of the
+    motion but of the scatter box (`STILL`).
+
     Args:
         plan, u: all plans that were replayed, x_0..x_K (n, K + 1, nx), and their controls
             (n, K, nu): `measured` is compiled for as many.
         certified: the plan whose certificate counts.
     """
-    end = family.problem.terminal_constraint
-    if end.rows == 0:
+    if family.problem.terminal_constraint.rows == 0:
         return
     still = np.repeat(plan[:, :1], plan.shape[1], axis=1), u
     off = np.zeros((len(plan), family.problem.dynamics.ndx))
-    _, found = measured(family, still, off, extents(family.problem, plan, u), tolerances)
-    for violation in found.of(certified):
-        if violation.kind.startswith("terminal") and NOTHING < violation.ratio < LOOSE:
+    given = family, still, off, extents(family.problem, plan, u), tolerances
+    ends, of_motion = _evaluated(*given)[2], _evaluated(*given, least=0.0)[2]
+    for kind, (size, allowed), (_, own) in zip(MEASURED[-2:], ends, of_motion, strict=True):
+        off_by, allow = (a[certified].astype(float) for a in (size, allowed))
+        loose = (off_by > NOTHING * allow) & (off_by < LOOSE * allow)
+        if (off_by >= LOOSE * allow).any():
+            loose &= off_by >= LOOSE * own[certified]
+        if loose.any():
+            entry = int(
+                np.argmax(np.where(loose, off_by / np.maximum(allow, np.finfo(float).tiny), -1.0))
+            )
             warnings.warn(
-                f"x_init is off the {words(violation.kind)} by {violation.size:.1e} only, and "
-                f"{violation.allowed:.1e} is tolerated, so its certificate says little: give "
-                f"tolerances=Tolerances({violation.kind}=...), or an x_scatter as wide as the "
-                "motion.",
+                f"x_init is off the {words(kind)} [{entry}] by {off_by[entry]:.1e} only, and "
+                f"{allow[entry]:.1e} is tolerated, so its certificate says little: give "
+                f"tolerances=Tolerances({kind}=...), or an x_scatter as wide as the motion.",
                 DraxWarning,
                 stacklevel=4,
             )
@@ -344,13 +355,8 @@ def measured(
         off: x_K - plan, (n, ndx).
         extent: of the plans, from `extents`.
     """
-    dtype = family.problem.x_init.dtype
-    with family.problem.arithmetic():
-        limits = tolerances.of(family.at(0)), tolerances.relative
-        with np.errstate(over="ignore"):  # what is beyond float32 is infinite
-            given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
-        cost, found = _measured(*family.parts, *given)
-    size, allowed, entry, knot = (np.asarray(a) for a in found)
+    cost, found, _ = _evaluated(family, motion, off, extent, tolerances)
+    size, allowed, entry, knot = found
 
     def framed(values: np.ndarray, filling: float) -> np.ndarray:
         """With a column for the goal in front, and one for the dynamics at the end."""
@@ -358,9 +364,26 @@ def measured(
 
     size = np.nan_to_num(size.astype(float), nan=np.inf)
     allowed = allowed.astype(float)
-    return np.asarray(cost), Violations(
+    return cost, Violations(
         framed(size, 0.0), framed(allowed, np.nan), framed(entry, -1), framed(knot, -1)
     )
+
+
+def _evaluated(
+    family: Family,
+    motion: tuple[np.ndarray, np.ndarray],
+    off: np.ndarray,
+    extent: tuple[np.ndarray, ...],
+    tolerances: Tolerances,
+    least: float = STILL,
+) -> Any:
+    """What `_measured` returns, on the host; `least` in place of `STILL`."""
+    dtype = family.problem.x_init.dtype
+    with family.problem.arithmetic():
+        limits = tolerances.of(family.at(0)), tolerances.relative, least
+        with np.errstate(over="ignore"):  # what is beyond float32 is infinite
+            given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+        return jax.tree.map(np.asarray, _measured(*family.parts, *given))
 
 
 @partial(compiled, key=identity_of_rows)
@@ -371,9 +394,12 @@ def _measured(
     motion: tuple[Array, Array],
     off: Array,
     extent: tuple[Array, ...],
-    limits: tuple[tuple[Array, ...], Array],
-) -> tuple[Array, tuple[Array, ...]]:
-    """Cost (n,); size, tolerance, entry and knot of the largest violation, (kinds, n) each."""
+    limits: Limits,
+) -> tuple[Array, tuple[Array, ...], list[tuple[Array, Array]]]:
+    """Cost (n,); size, tolerance, entry and knot of the largest violation, (kinds, n) each.
+
+    Also sizes and tolerances of all entries, (n, entries), of the last two kinds, at the end.
+    """
 
     def of_motion(own: Problem, motion: tuple[Array, Array], off: Array, extent: Any) -> Any:
         states, u = motion
@@ -381,12 +407,13 @@ def _measured(
         start = problem.start_from(states[0])
         if not problem.free:
             problem = replace(problem, x_init=states[0])
-        kinds = _sizes_and_tolerances(problem, motion, off, extent, limits)
+        kinds = list(_sizes_and_tolerances(problem, motion, off, extent, limits))
         worst = [_largest(*kind) for kind in kinds]
+        ends = [(size[0], allowed[0]) for size, allowed, _ in kinds[-2:]]
         cost = problem.cost(Trajectory(states[1:], u, start=start))
-        return cost, tuple(map(jnp.stack, zip(*worst, strict=True)))
+        return cost, tuple(map(jnp.stack, zip(*worst, strict=True))), ends
 
-    found: Any = jax.vmap(of_motion, out_axes=(0, 1))(own, motion, off, extent)
+    found: Any = jax.vmap(of_motion, out_axes=(0, 1, 0))(own, motion, off, extent)
     return found
 
 
@@ -409,11 +436,11 @@ def _sizes_and_tolerances(
     motion: tuple[Array, Array],
     off: Array,
     extent: tuple[Array, ...],
-    limits: tuple[tuple[Array, ...], Array],
+    limits: Limits,
 ) -> Iterator[tuple[Array, Array, int]]:
     """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
-    given, relative = limits
-    E = tuple(map(jnp.maximum, extent, (STILL * width for width in scatter_widths(problem))))
+    given, relative, least = limits
+    E = tuple(map(jnp.maximum, extent, (least * width for width in scatter_widths(problem))))
     parts = _sizes_and_scales(problem, *motion, off, E)
     for (size, scale, first), number in zip(parts, given, strict=True):
         allowed = jnp.where(jnp.isnan(number), relative * scale, number)
@@ -504,7 +531,7 @@ def by_entry(
     """
     dtype = problem.x_init.dtype
     with problem.arithmetic():
-        limits = tolerances.of(problem), tolerances.relative
+        limits = tolerances.of(problem), tolerances.relative, STILL
         given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
         found = jax.tree.map(np.asarray, _by_entry(problem, *given))
     return [
@@ -521,7 +548,7 @@ def _by_entry(
     motion: tuple[Array, Array],
     off: Array,
     extent: tuple[Array, ...],
-    limits: tuple[tuple[Array, ...], Array],
+    limits: Limits,
 ) -> list[tuple[Array, Array, int]]:
     """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
     if not problem.free:

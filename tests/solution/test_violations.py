@@ -410,8 +410,32 @@ def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, 
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         warn_of_loose_ends(*given)
-    told = [f"off the terminal equality by {place:.1e}" in str(w.message) for w in found]
+    told = [f"off the terminal equality [0] by {place:.1e}" in str(w.message) for w in found]
     assert told == [True] * warned
+
+
+@pytest.mark.parametrize(
+    ("far", "moves", "warned"),
+    [(1e-5, 2e-6, True), (1e-5, 0.5, False), (0.5, 0.5, False), (0.0, 0.0, False)],
+    ids=["fine-axis", "ends-near-its-start", "far", "stays"],
+)
+def test_an_entry_that_asks_less_than_the_box_lets_it_is_warned_of(far, moves, warned):
+    def step(x, u):
+        return x + 0.1 * u
+
+    target = jnp.array([1.0, far])
+    gantry = from_function(
+        step, x_init=[0.0, 0.0], nu=2, horizon=1.0, dt=0.1, running_cost=lambda x, u: u @ u,
+        terminal_equality=lambda x: x - target,
+    )  # fmt: skip
+    x = np.linspace(0.0, [1.0, moves], 11)[None]
+    u = np.diff(x, axis=1) / 0.1
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        warn_of_loose_ends(Family.of_one(gantry), x, u, Tolerances(), 0)
+    assert [f"terminal equality [1] by {far:.1e}" in str(w.message) for w in found] == [
+        True
+    ] * warned
 
 
 def test_of_violations_without_a_tolerance_the_largest_is_told():
