@@ -32,6 +32,9 @@ def rows(data: Any, times: np.ndarray) -> Any:
 
     def row(path: Any, leaf: Any) -> Any:
         name = "data" + jax.tree_util.keystr(path)
+        if isinstance(leaf, jax.core.Tracer):  # by what makes many problems
+            require_length(name, leaf, count)
+            return leaf
         try:
             array = np.asarray(leaf)
             if array.dtype.kind not in "biuf":
@@ -40,11 +43,7 @@ def rows(data: Any, times: np.ndarray) -> Any:
             raise DraxError(
                 f"{name} is {shown(leaf)}: give arrays of numbers, a row for each of {count} knots."
             ) from error
-        if array.ndim == 0 or len(array) != count:
-            raise DraxError(
-                f"{name} has shape {array.shape}: give {count} rows, one for each of the knots "
-                f"0..{count - 1}, or a function of time."
-            )
+        require_length(name, array, count)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise DraxError(
                 f"{name} is not finite in row {int(np.argwhere(~np.isfinite(array))[0][0])}: give "
@@ -53,6 +52,15 @@ def rows(data: Any, times: np.ndarray) -> Any:
         return jnp.asarray(array)
 
     return jax.tree_util.tree_map_with_path(row, data)
+
+
+def require_length(name: str, array: Any, count: int) -> None:
+    """Complain about an array that has no row for each of `count` knots."""
+    if np.ndim(array) == 0 or len(array) != count:
+        raise DraxError(
+            f"{name} has shape {np.shape(array)}: give {count} rows, one for each of the knots "
+            f"0..{count - 1}, or a function of time."
+        )
 
 
 def _of_function(data: Callable[[Any], Any], times: np.ndarray) -> Any:

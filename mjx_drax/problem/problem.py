@@ -26,7 +26,7 @@ from mjx_drax.base.numbers import vector
 from mjx_drax.base.pytrees import HostOnly, Static, register_dataclass, with_host_fields
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.problem.cost import Constraint, Cost
-from mjx_drax.problem.data import later, require_rows
+from mjx_drax.problem.data import later, require_length, require_rows
 from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.rollout import follow, in_double
@@ -527,7 +527,9 @@ class Problem:
             require_rows(data)
         with self.arithmetic():
             found = data_rows(data, self.times)
-            return checked(replace(self, data=found, data_at=data if callable(data) else None))
+            moved = replace(self, data=found, data_at=data if callable(data) else None)
+            traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(found))
+            return moved if traced else checked(moved)
 
     def at_time(self, t_init: float) -> Problem:
         """The same problem with x_0 at another time [s].
@@ -578,6 +580,8 @@ def checked(problem: Problem) -> Problem:
             f"x_init has shape {start.shape}: give {nx} numbers, the states of the dynamics."
         )
     _check_bounds(problem, start)
+    for path, rows in jax.tree_util.tree_leaves_with_path(problem.data):
+        require_length("data" + jax.tree_util.keystr(path), rows, problem.horizon + 1)
     costs = (problem.running, problem.terminal)
     if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
         raise DraxError(f"{name} has no cost: give a running or a terminal one.")

@@ -140,7 +140,8 @@ class Family:
                 words = "what it builds takes numbers, not traced values" if ours else plain(error)
                 raise DraxError(
                     f"make failed when it was traced: {words}. Let it change numbers of a problem "
-                    "built outside of it, by JAX: lambda x: problem.with_x_init(x)."
+                    "built outside of it, by JAX: lambda x: problem.with_x_init(x), with_data or "
+                    "dataclasses.replace."
                 ) from error
             tree.append(structure)
             return [jnp.asarray(a) for a, d in zip(found, differs, strict=True) if d]

@@ -24,6 +24,7 @@ from mjx_drax import (
 )
 from mjx_drax.modelling.terms import Reference
 from mjx_drax.problem.trajectory import Knot
+from mjx_drax.search.family import Family
 
 TIMES = DT * np.arange(K + 1)
 
@@ -99,6 +100,19 @@ def test_dynamics_that_depend_on_time_replay_in_float64():
 def _as_replayed(problem, u):
     plan = np.zeros((1, K + 1, 2))
     return plan, u[None, :, None], np.zeros((1, K, 1, 2))
+
+
+def test_a_batch_makes_problems_of_their_data():
+    problem = double_integrator(running_residual=off_track, data={"p": np.sin(TIMES)})
+    references = np.stack([np.sin(TIMES), np.zeros(K + 1), TIMES])
+    family = Family.of(lambda p: problem.with_data({"p": p}), references)
+    for i, p in enumerate(references):
+        np.testing.assert_allclose(family.at(i).data["p"], p, rtol=1e-6)
+    amplitudes = np.array([1.0, 2.0])
+    family = Family.of(lambda a: problem.with_data(lambda t: {"p": a * t}), amplitudes)
+    np.testing.assert_allclose(family.at(1).data["p"], 2.0 * TIMES, rtol=1e-6)
+    with pytest.raises(DraxError, match=f"give {K + 1} rows"):
+        Family.of(lambda p: problem.with_data({"p": p}), references[:, 1:])
 
 
 @pytest.mark.slow
