@@ -130,7 +130,9 @@ def test_a_kernel_is_chosen_by_the_size_of_blocks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("noisy", "ndx"), [(True, NDX), (False, NDX), (False, MAX_NDX + 1)])
+@pytest.mark.parametrize(
+    ("noisy", "ndx"), [(True, NDX), (False, NDX), (False, riccati_blocks.MAX_NDX + 1)]
+)
 def test_on_gpus_it_serves_all_maps_of_blocks_that_are_small(noisy, ndx, monkeypatch):
     """As on a GPU, but interpreted: chains within problems are one launch."""
     arguments = batch(6, np.float32, noisy, ndx)
