@@ -10,15 +10,15 @@ from __future__ import annotations
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from mjx_drax.kernels.batching import block_for_each_row
-from mjx_drax.kernels.linalg import symmetric
+from mjx_drax.kernels.linalg import cholesky, solve_upper, symmetric
 from mjx_drax.kernels.riccati_threads import Given, Link, Segmented
 from mjx_drax.kernels.tiles import (
     diagonal,
-    inverted,
     padded,
     products,
     rooted,
@@ -39,18 +39,14 @@ WARPS = 4
 
 
 class Factors(NamedTuple):
-    """What `followed` needs of all stages; T = mu S^{-1}, None without a penalty.
-
-    With white numbers also the noise of controls and of defects, before what they lead to.
-    """
+    """What `followed` needs of all stages; T = mu S^{-1}, None without a penalty."""
 
     K: Array
     kff: Array
     P: Array
     p: Array
+    Quu: Array
     T: Array | None = None
-    of_u: Array | None = None
-    of_x: Array | None = None
 
 
 def factorized(given: Given, interpret: bool = False) -> Factors:
@@ -60,11 +56,7 @@ def factorized(given: Given, interpret: bool = False) -> Factors:
     shapes: dict[str, Any] = {"K": (M, N), "kff": (M,), "P": (N, N), "p": (N,), "Quu": (M, M)}
     shapes |= {} if given.penalty is None else {"T": (N, N)}
     full = {name: (rows, K, *shape) for name, shape in shapes.items()}
-    found = _through(backward, given, full, interpret)
-    Quu = found.pop("Quu")
-    if given.xi_u is not None and given.xi_e is not None:
-        found |= _colored(given, found["P"], Quu, given.xi_u, given.xi_e, interpret)
-    return Factors(**found)
+    return Factors(**_through(backward, given, full, interpret))
 
 
 def condensed(given: Given, interpret: bool = False) -> Link:
@@ -111,9 +103,10 @@ def followed(
         assert factors.T is not None
         arrays += [factors.T, (1.0 / given.penalty)[:, None]]
     shapes: dict[str, tuple[int, ...]] = {"dx": (N,), "du": (M,), "rate": (N,)}
-    noisy = factors.of_u is not None
-    if factors.of_u is not None and factors.of_x is not None:
-        arrays += [factors.of_u, factors.of_x]
+    noisy = given.xi_u is not None and given.xi_e is not None
+    if given.xi_u is not None and given.xi_e is not None:
+        of_u, of_x = _colored(given, factors, given.xi_u, given.xi_e)
+        arrays += [padded(of_u, M), padded(of_x, N)]
         shapes |= {"noise_x": (N,), "noise_u": (M,)}
     full: dict[str, tuple[int, ...]] = {name: (rows, K, *s) for name, s in shapes.items()}
     step = block_for_each_row(partial(forward, K, soft, noisy), full, arrays, WARPS, interpret)
@@ -122,27 +115,20 @@ def followed(
     return {"noise_x": None, "noise_u": None, **found, "gains": factors.K[..., :m, :n]}
 
 
-def _colored(
-    given: Given, P: Array, Quu: Array, xi_u: Array, xi_e: Array, interpret: bool
-) -> dict[str, Array]:
-    """The noise of controls and of defects, from white numbers: of all stages at once."""
-    rows, K, n, m = given.B.shape
-    none = jnp.zeros(rows, P.dtype)
+def _colored(given: Given, factors: Factors, xi_u: Array, xi_e: Array) -> tuple[Array, Array]:
+    """The noise of controls and of defects, from white numbers."""
+    n, m = given.B.shape[2:]
+
+    def colored(soft: Array, Quu: Array, P: Array, xi_u: Array, xi_e: Array) -> tuple[Array, Array]:
+        Ls = cholesky(jnp.eye(n, dtype=P.dtype) + soft * P[:n, :n])
+        kicks = jnp.sqrt(soft) * solve_upper(Ls, xi_e)
+        return solve_upper(cholesky(Quu[:m, :m]), xi_u), kicks
+
+    over_stages = jax.vmap(colored, in_axes=(None, 0, 0, 0, 0))
+    none = jnp.zeros(len(given.h), given.h.dtype)
     soft = none if given.penalty is None else 1.0 / given.penalty
-    stages = jnp.repeat(soft, K), padded(xi_u, Quu.shape[-1]), padded(xi_e, P.shape[-1])
-
-    def body(
-        s_ref: Any, u_ref: Any, e_ref: Any, P_ref: Any, Q_ref: Any, of_u: Any, of_x: Any
-    ) -> None:
-        s = s_ref[0, 0]
-        of_u[0] = inverted(Q_ref[0], m, u_ref[0])[1]
-        S = diagonal(P.shape[-1], P.dtype) + s * P_ref[0]
-        of_x[0] = jnp.sqrt(s) * inverted(S, n, e_ref[0])[1]
-
-    arrays = [a.reshape(rows * K, *a.shape[2:] if a.ndim > 1 else (1,)) for a in (*stages, P, Quu)]
-    shapes = {"of_u": arrays[1].shape, "of_x": arrays[2].shape}
-    found = block_for_each_row(body, shapes, arrays, WARPS, interpret)
-    return {name: a.reshape(rows, K, -1) for name, a in found.items()}
+    of_u, of_x = jax.vmap(over_stages)(soft, factors.Quu, factors.P, xi_u, xi_e)
+    return of_u, of_x
 
 
 def recursion(F: Array, f: Array, interpret: bool = False) -> Array:

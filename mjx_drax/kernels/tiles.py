@@ -32,44 +32,20 @@ def products(interpret: bool) -> Callable[[Array, Array], Array]:
 
 def swept(T: Array, count: int) -> Array:
     """T after sweeps of its first `count` rows; see above."""
-    swept_T: Array = _sweeps(T, count, None)[0]
-    return swept_T
-
-
-def inverted(T: Array, count: int, white: Array) -> tuple[Array, Array]:
-    """T^{-1}, and L'^{-1} white for T = L L': noise with the covariance T^{-1}.
-
-    The column of L is what a sweep finds, over the root of the pivot. L'^{-1} is T^{-1} L.
-    """
-    T, root = _sweeps(T, count, white)
-    return -T, -times(T, root)
-
-
-def _sweeps(T: Array, count: int, white: Array | None) -> tuple[Array, ...]:
-    """T after sweeps, and L white."""
     rows, columns = indices(T.shape[0])
-    place = jnp.arange(T.shape[0])
 
-    def sweep(k: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        T, *root = carry
+    def sweep(k: Array, T: Array) -> Array:
         of_column = columns == k
         column = jnp.sum(jnp.where(of_column, T, 0.0), axis=1)
-        pivot = jnp.sum(jnp.where(place == k, column, 0.0))
-        pivot = jnp.where(pivot > 0.0, pivot, jnp.nan)
-        scaled = column / pivot
+        pivot = jnp.sum(jnp.where(jnp.arange(T.shape[0]) == k, column, 0.0))
+        scaled = column / jnp.where(pivot > 0.0, pivot, jnp.nan)
         inner = T - column[:, None] * scaled[None, :]
         border = jnp.where(of_column, scaled[:, None], scaled[None, :])
         there = of_column | (rows == k)
         corner = of_column & (rows == k)
-        T = jnp.where(corner, -1.0 / pivot, jnp.where(there, border, inner))
-        if white is None:
-            return (T,)
-        share = jnp.sum(jnp.where(place == k, white, 0.0)) * lax.rsqrt(pivot)
-        return T, root[0] + jnp.where(place >= k, share * column, 0.0)
+        return jnp.where(corner, -1.0 / pivot, jnp.where(there, border, inner))
 
-    start = (T,) if white is None else (T, jnp.zeros_like(white))
-    found: tuple[Array, ...] = lax.fori_loop(0, count, sweep, start)
-    return found
+    return lax.fori_loop(0, count, sweep, T)
 
 
 def rooted(C: Array, count: int) -> Array:
