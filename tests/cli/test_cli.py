@@ -210,7 +210,7 @@ def test_ctrl_c_saves_the_best_so_far(tmp_path, capsys, monkeypatch):
     def interrupt(self, done, total, info):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mjx_drax.solution.progress.Bar.__call__", interrupt)
+    monkeypatch.setattr("mjx_drax.solution.progress.Lines.__call__", interrupt)
     arguments = "solve pendulum --horizon 0.5 --chains 2 --iterations 400 --no-video"
     assert main([*arguments.split(), "--out", str(tmp_path)]) == 1
     assert "written to" in capsys.readouterr().out
