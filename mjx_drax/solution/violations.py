@@ -320,19 +320,18 @@ def warn_of_loose_ends(
     still = np.repeat(plan[:, :1], plan.shape[1], axis=1), u
     off = np.zeros((len(plan), family.problem.dynamics.ndx))
     given = family, still, off, extents(family.problem, plan, u), tolerances
-    ends, of_motion = _evaluated(*given)[2], _evaluated(*given, least=0.0)[2]
-    for kind, (size, allowed), (_, own) in zip(MEASURED[-2:], ends, of_motion, strict=True):
-        off_by, allow = (a[certified].astype(float) for a in (size, allowed))
-        loose = (off_by > NOTHING * allow) & (off_by < LOOSE * allow)
-        if (off_by >= LOOSE * allow).any():
-            loose &= off_by >= LOOSE * own[certified]
+    ends = _evaluated(*given)[2]
+    for i, kind in enumerate(MEASURED[-2:]):
+        off_by, allowed = (a[certified].astype(float) for a in ends[i])
+        loose = (off_by > NOTHING * allowed) & (off_by < LOOSE * allowed)
+        if loose.any() and (off_by >= LOOSE * allowed).any():
+            of_motion = _evaluated(*given, least=0.0)[2][i][1][certified]
+            loose &= off_by >= LOOSE * of_motion
         if loose.any():
-            entry = int(
-                np.argmax(np.where(loose, off_by / np.maximum(allow, np.finfo(float).tiny), -1.0))
-            )
+            entry = int(np.argmax(loose))
             warnings.warn(
                 f"x_init is off the {words(kind)} [{entry}] by {off_by[entry]:.1e} only, and "
-                f"{allow[entry]:.1e} is tolerated, so its certificate says little: give "
+                f"{allowed[entry]:.1e} is tolerated, so its certificate says little: give "
                 f"tolerances=Tolerances({kind}=...), or an x_scatter as wide as the motion.",
                 DraxWarning,
                 stacklevel=4,
