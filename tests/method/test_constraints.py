@@ -277,24 +277,6 @@ SHORT = Langevin(iterations=15, tail=5)
 
 
 @pytest.mark.slow
-def test_no_constraints_are_the_same_as_constraints_without_rows():
-    def nothing(*_):
-        return jnp.zeros(0)
-
-    labels = ("equality", "inequality", "terminal_equality", "terminal_inequality")
-    end = {"terminal_residual": Partial(miss, TARGET), "u_bounds": (-1.0, 1.0)}
-    plain, empty = (
-        run(SHORT, cart(**end, **rows)) for rows in ({}, dict.fromkeys(labels, nothing))
-    )
-    assert plain.trajectory.slack is None
-    assert empty.trajectory.slack is None
-    np.testing.assert_array_equal(plain.trajectory.x, empty.trajectory.x)
-    np.testing.assert_array_equal(plain.trajectory.u, empty.trajectory.u)
-    np.testing.assert_array_equal(plain.multipliers.dynamics, empty.multipliers.dynamics)
-    assert np.abs(plain.trajectory.u).max() > 0.1
-
-
-@pytest.mark.slow
 def test_numbers_of_constraints_change_without_recompiling():
     before, ends = iterate.iterate._cache_size(), []
     for limit, target in ((0.7, TARGET), (0.4, TARGET), (0.7, 2 * TARGET)):
