@@ -38,7 +38,7 @@ from mjx_drax.solution.replay import (
     plan_violations,
 )
 from mjx_drax.solution.report import counts, html
-from mjx_drax.solution.results import statuses, tolerance_of
+from mjx_drax.solution.results import followed, statuses, tolerance_of
 from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances, most_broken
 
 SHARE = 0.5
@@ -160,8 +160,11 @@ class BatchSolution:
 
     @property
     def optimal(self) -> np.ndarray:
-        """Whether the plan is certified and its residual below the tolerance, (N,)."""
-        return self.certified & (self.residual < self.tolerance)
+        """Whether the plan is certified and followed, its residual below the tolerance, (N,)."""
+        deviations = self.open_loop.max_deviation, self.feedback.max_deviation
+        off = np.where(self.open_loop_is_better, *deviations)
+        as_planned = followed(self.x[:, 1:], off, self.plan_cost, self.cost)
+        return self.certified & as_planned & (self.residual < self.tolerance)
 
     @property
     def status(self) -> list[str]:

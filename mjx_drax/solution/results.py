@@ -54,6 +54,11 @@ DIVERGED, INTERRUPTED = "diverged", "interrupted"
 
 CONVERGED, STALLED, UNFINISHED, UNPOLISHED = "converged", "stalled", "unfinished", "none"
 
+FOLLOWED = 0.1
+"""A replay that deviates by more than this share of the motion, and costs another amount by more
+than this share, is another motion: with a goal it may succeed, and its plan's residual says nothing
+of it."""
+
 SAME_COST = 1e-4
 """Share of a cost by which another one counts as the same."""
 
@@ -192,8 +197,15 @@ class Results:
 
     @cached_property
     def optimal_chains(self) -> np.ndarray:
-        """Whether a chain is certified and its residual below the tolerance, (chains,)."""
-        return self.certified_chains & (self.residual < self.tolerance)
+        """Whether a chain is certified, `followed`, its residual below the tolerance, (chains,)."""
+        return self.certified_chains & self.followed & (self.residual < self.tolerance)
+
+    @cached_property
+    def followed(self) -> np.ndarray:
+        """Whether the better replay is the motion that was planned, to a tenth; (chains,)."""
+        deviations = self.open_loop.max_deviation, self.feedback.max_deviation
+        off = np.where(self.open_loop_is_better, *deviations)
+        return followed(np.asarray(self.trajectories.x), off, self.cost, self.replay_cost)
 
     @cached_property
     def status(self) -> list[str]:
@@ -318,7 +330,7 @@ class Results:
 
     @property
     def optimal(self) -> bool:
-        """Whether the best chain is certified, and its residual is below the tolerance."""
+        """Whether the best chain is certified and `followed`, its residual below the tolerance."""
         return bool(self.optimal_chains[self.best_chain])
 
     @property
@@ -343,6 +355,8 @@ class Results:
         """What is known of the best chain's optimality, in words."""
         best, problem = self.best_chain, self.problem
         words = optimality(self, best)
+        if self.certified and not self.followed[best]:
+            return f"{words}, of a plan that the replay does not follow"
         rounded = problem.precision == 32 and not problem.dynamics.kinked
         more = self.polished[best] == STALLED and rounded
         return f"{words}; precision=64 may get further" if more else words
@@ -391,6 +405,20 @@ def stalled_of(state: State) -> np.ndarray:
     progress = state.polish
     known = isinstance(progress, PolishProgress)
     return np.asarray(progress.stalled if known else np.zeros(len(state.trajectory.u), bool))
+
+
+def followed(x: np.ndarray, off: np.ndarray, cost: np.ndarray, replayed: np.ndarray) -> np.ndarray:
+    """Whether replays are the motions of their plans (n, K, nx), (n,): in states or in cost.
+
+    Args:
+        off: the replays' largest deviations from the plans, (n,).
+        cost, replayed: of plans and of replays, (n,).
+    """
+    with np.errstate(invalid="ignore"):  # of plans that are not finite
+        near = off <= FOLLOWED * np.ptp(x, axis=1).max(axis=1, initial=0.0)
+        least = np.maximum(np.abs(cost), np.abs(replayed))
+        alike: np.ndarray = np.abs(replayed - cost) <= FOLLOWED * least
+    return near | alike
 
 
 def optimality(found: Any, chain: int) -> str:

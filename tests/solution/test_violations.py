@@ -27,6 +27,7 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.program import from_program
 from mjx_drax.solution.replay import open_loop_is_better, replays
 from mjx_drax.solution.report import lines
+from mjx_drax.solution.results import followed
 from mjx_drax.solution.violations import (
     KINDS,
     Violation,
@@ -395,6 +396,22 @@ def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
     assert not found.optimal.any()
     strict = replace(found, chain_residual=np.zeros_like(found.chain_residual))
     np.testing.assert_array_equal(strict.optimal, found.certified)
+
+
+def test_a_plan_that_its_replay_does_not_follow_is_not_called_optimal():
+    x = np.linspace(0.0, [[1.0], [1.0], [1.0], [1.0]], 5, axis=1)  # (4, 5, 1)
+    off, cost = np.array([0.0, 2.0, 2.0, 0.05]), np.array([1.0, 1.0, 1.0, 1e-9])
+    replayed = np.array([1.0, 1.02, 50.0, 1e-7])  # the third reaches its goal some other way
+    np.testing.assert_array_equal(followed(x, off, cost, replayed), [True, True, False, True])
+    found = solve(point(), chains=2, progress=False)
+    assert found.optimal
+    assert found.followed.all()
+    other = replace(found.feedback, max_deviation=np.full(2, 9.0), cost=found.feedback.cost + 1.0)
+    other = replace(found, feedback=other, open_loop=other)
+    assert other.certified
+    assert not other.optimal
+    assert other.verdict == "CERTIFIED, not known to be optimal"
+    assert other.optimality.endswith("of a plan that the replay does not follow")
 
 
 @pytest.mark.parametrize(
