@@ -33,12 +33,13 @@ from mjx_drax.solution.replay import (
     WITH_FEEDBACK,
     Replays,
     both_ways,
+    followed,
     largest_defect,
     open_loop_is_better,
     plan_violations,
 )
 from mjx_drax.solution.report import counts, html
-from mjx_drax.solution.results import followed, statuses, tolerance_of
+from mjx_drax.solution.results import statuses, tolerance_of
 from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances, most_broken
 
 SHARE = 0.5
@@ -161,9 +162,8 @@ class BatchSolution:
     @property
     def optimal(self) -> np.ndarray:
         """Whether the plan is certified and followed, its residual below the tolerance, (N,)."""
-        deviations = self.open_loop.max_deviation, self.feedback.max_deviation
-        off = np.where(self.open_loop_is_better, *deviations)
-        as_planned = followed(self.x[:, 1:], off, self.plan_cost, self.cost)
+        replays = self.open_loop, self.feedback
+        as_planned = followed(self.family.at(0), self.x, self.plan_cost, *replays)
         return self.certified & as_planned & (self.residual < self.tolerance)
 
     @property

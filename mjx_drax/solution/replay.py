@@ -25,15 +25,22 @@ from mjx_drax.solution.violations import (
     DYNAMICS,
     GOAL,
     KINDS,
+    STILL,
     TRACKING,
     Tolerances,
     Violation,
     Violations,
     extents,
     measured,
+    scatter_widths,
 )
 
 OPEN_LOOP, WITH_FEEDBACK = "open loop", "with feedback"
+
+FOLLOWED = 0.1
+"""A replay that deviates by more than this share of the motion, and costs another amount by more
+than this share, is another motion: with a goal it may succeed, and its plan's residual says nothing
+of it."""
 
 ROUNDING = 1e-5
 """Costs of replays, summed in float32, are alike if they differ by this share."""
@@ -106,6 +113,27 @@ def open_loop_is_better(open_loop: Replays, feedback: Replays) -> np.ndarray:
     one, other = open_loop.cost, feedback.cost
     no_cheaper = (one <= other) | np.isclose(one, other, ROUNDING, 0.0)
     return open_loop.success & (no_cheaper | ~feedback.success)
+
+
+def followed(
+    problem: Problem, plan: np.ndarray, cost: np.ndarray, open_loop: Replays, feedback: Replays
+) -> np.ndarray:
+    """Whether the better replays are the motions that were planned, (n,): in states, or in cost.
+
+    Args:
+        plan: states, (n, knots, nx).
+        cost: of the plans, (n,).
+    """
+    better = open_loop_is_better(open_loop, feedback)
+    off = np.where(better, open_loop.max_deviation, feedback.max_deviation)
+    replayed = np.where(better, open_loop.cost, feedback.cost)
+    with problem.arithmetic():
+        least = STILL * float(scatter_widths(problem)[0].max(initial=0.0))
+    with np.errstate(invalid="ignore"):  # of plans that are not finite
+        moves = np.maximum(np.ptp(plan, axis=1).max(axis=1, initial=0.0), least)
+        most = np.maximum(np.abs(cost), np.abs(replayed))
+        alike: np.ndarray = np.abs(replayed - cost) <= FOLLOWED * most
+    return (off <= FOLLOWED * moves) | alike
 
 
 def replays(

@@ -5,7 +5,7 @@ controls are replayed from x_init (see `replay`), and three things are said of e
 
     replays       it reaches the goal, or ends as planned, open loop or with feedback
     constraints   the same replay keeps all bounds and constraints, within tolerances
-    optimality    the residual of the optimality conditions of its plan is below a tolerance
+    optimality    it follows its plan, whose optimality conditions have a residual below a tolerance
 
 It is *certified* if its plan is feasible and the first two hold, and *optimal* if all three do. The
 better one of its two replays, which succeeds and is cheaper, speaks for a chain.
@@ -37,6 +37,7 @@ from mjx_drax.solution.replay import (
     WITH_FEEDBACK,
     Certificate,
     Replays,
+    followed,
     largest_defect,
     open_loop_is_better,
 )
@@ -53,11 +54,6 @@ OPTIMAL, FEASIBLE_ONLY, INFEASIBLE = "optimal", "feasible", "infeasible"
 DIVERGED, INTERRUPTED = "diverged", "interrupted"
 
 CONVERGED, STALLED, UNFINISHED, UNPOLISHED = "converged", "stalled", "unfinished", "none"
-
-FOLLOWED = 0.1
-"""A replay that deviates by more than this share of the motion, and costs another amount by more
-than this share, is another motion: with a goal it may succeed, and its plan's residual says nothing
-of it."""
 
 SAME_COST = 1e-4
 """Share of a cost by which another one counts as the same."""
@@ -203,9 +199,8 @@ class Results:
     @cached_property
     def followed(self) -> np.ndarray:
         """Whether the better replay is the motion that was planned, to a tenth; (chains,)."""
-        deviations = self.open_loop.max_deviation, self.feedback.max_deviation
-        off = np.where(self.open_loop_is_better, *deviations)
-        return followed(np.asarray(self.trajectories.x), off, self.cost, self.replay_cost)
+        x = np.asarray(self.trajectories.x)
+        return followed(self.problem, x, self.cost, self.open_loop, self.feedback)
 
     @cached_property
     def status(self) -> list[str]:
@@ -354,12 +349,17 @@ class Results:
     def optimality(self) -> str:
         """What is known of the best chain's optimality, in words."""
         best, problem = self.best_chain, self.problem
-        words = optimality(self, best)
-        if self.certified and not self.followed[best]:
-            return f"{words}, of a plan that the replay does not follow"
+        words = self.optimality_of(best)
         rounded = problem.precision == 32 and not problem.dynamics.kinked
         more = self.polished[best] == STALLED and rounded
         return f"{words}; precision=64 may get further" if more else words
+
+    def optimality_of(self, chain: int) -> str:
+        """What the residual of a chain's plan says, in words, and whether its replay is another."""
+        words = optimality(self, chain)
+        if self.certified_chains[chain] and not self.followed[chain]:
+            return f"{words}, of a plan that the replay does not follow"
+        return words
 
     @property
     def verdict(self) -> str:
@@ -405,20 +405,6 @@ def stalled_of(state: State) -> np.ndarray:
     progress = state.polish
     known = isinstance(progress, PolishProgress)
     return np.asarray(progress.stalled if known else np.zeros(len(state.trajectory.u), bool))
-
-
-def followed(x: np.ndarray, off: np.ndarray, cost: np.ndarray, replayed: np.ndarray) -> np.ndarray:
-    """Whether replays are the motions of their plans (n, K, nx), (n,): in states or in cost.
-
-    Args:
-        off: the replays' largest deviations from the plans, (n,).
-        cost, replayed: of plans and of replays, (n,).
-    """
-    with np.errstate(invalid="ignore"):  # of plans that are not finite
-        near = off <= FOLLOWED * np.ptp(x, axis=1).max(axis=1, initial=0.0)
-        least = np.maximum(np.abs(cost), np.abs(replayed))
-        alike: np.ndarray = np.abs(replayed - cost) <= FOLLOWED * least
-    return near | alike
 
 
 def optimality(found: Any, chain: int) -> str:

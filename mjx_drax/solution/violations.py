@@ -377,12 +377,17 @@ def _evaluated(
     least: float = STILL,
 ) -> Any:
     """What `_measured` returns, on the host; `least` in place of `STILL`."""
-    dtype = family.problem.x_init.dtype
     with family.problem.arithmetic():
-        limits = tolerances.of(family.at(0)), tolerances.relative, least
-        with np.errstate(over="ignore"):  # what is beyond float32 is infinite
-            given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+        given = _on_device(family.at(0), motion, off, extent, tolerances, least)
         return jax.tree.map(np.asarray, _measured(*family.parts, *given))
+
+
+def _on_device(problem: Problem, motion: Any, off: Any, extent: Any, *limits: Any) -> Any:
+    """Arguments of `_measured` and `_by_entry`; limits are tolerances, and `STILL` or less."""
+    tolerances, least = limits
+    every = motion, off, extent, (tolerances.of(problem), tolerances.relative, least)
+    with np.errstate(over="ignore"):  # what is beyond float32 is infinite
+        return jax.tree.map(lambda a: jnp.asarray(a, problem.x_init.dtype), every)
 
 
 @partial(compiled, key=identity_of_rows)
@@ -528,10 +533,8 @@ def by_entry(
         off: x_K - plan, (ndx,).
         extent: of the plan, from `extents`, without its first axis.
     """
-    dtype = problem.x_init.dtype
     with problem.arithmetic():
-        limits = tolerances.of(problem), tolerances.relative, STILL
-        given = jax.tree.map(lambda a: jnp.asarray(a, dtype), (motion, off, extent, limits))
+        given = _on_device(problem, motion, off, extent, tolerances, STILL)
         found = jax.tree.map(np.asarray, _by_entry(problem, *given))
     return [
         violation

@@ -19,7 +19,6 @@ from mjx_drax.physics.c_engine.states import finite, interpolated
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.problem import Problem
-from mjx_drax.solution.results import optimality
 from mjx_drax.solution.solution import Solution
 from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
@@ -292,7 +291,7 @@ def outcome_lines(
         problem.name,
         f"cost {cost:.3g}   max|h| {defect:.1g}",
         f"bound violation {violation:.1g}",
-        optimality(solution, chain),
+        solution.optimality_of(chain),
         made,
         told,
         "t = {time}",

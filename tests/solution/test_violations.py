@@ -25,9 +25,8 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.program import from_program
-from mjx_drax.solution.replay import open_loop_is_better, replays
+from mjx_drax.solution.replay import followed, open_loop_is_better, replays
 from mjx_drax.solution.report import lines
-from mjx_drax.solution.results import followed
 from mjx_drax.solution.violations import (
     KINDS,
     Violation,
@@ -399,11 +398,13 @@ def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
 
 
 def test_a_plan_that_its_replay_does_not_follow_is_not_called_optimal():
-    x = np.linspace(0.0, [[1.0], [1.0], [1.0], [1.0]], 5, axis=1)  # (4, 5, 1)
-    off, cost = np.array([0.0, 2.0, 2.0, 0.05]), np.array([1.0, 1.0, 1.0, 1e-9])
-    replayed = np.array([1.0, 1.02, 50.0, 1e-7])  # the third reaches its goal some other way
-    np.testing.assert_array_equal(followed(x, off, cost, replayed), [True, True, False, True])
+    x = np.linspace(0.0, [[1.0], [1.0], [1.0], [1.0], [0.0]], 5, axis=1)  # (5, 5, 1)
+    off, cost = np.array([0.0, 2.0, 2.0, 0.05, 2e-8]), np.array([1.0, 1.0, 1.0, 1e-9, 1e-25])
+    replayed = np.array([1.0, 1.02, 50.0, 1e-7, 4e-15])  # the third reaches its goal another way
     found = solve(point(), chains=2, progress=False)
+    ran = replace(found.feedback, max_deviation=off, cost=replayed, success=np.ones(5, bool))
+    kept = followed(found.problem, x, cost, ran, ran)
+    np.testing.assert_array_equal(kept, [True, True, False, True, True])  # the last one rests
     assert found.optimal
     assert found.followed.all()
     other = replace(found.feedback, max_deviation=np.full(2, 9.0), cost=found.feedback.cost + 1.0)
@@ -450,9 +451,8 @@ def test_an_entry_that_asks_less_than_the_box_lets_it_is_warned_of(far, moves, w
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         warn_of_loose_ends(Family.of_one(gantry), x, u, Tolerances(), 0)
-    assert [f"terminal equality [1] by {far:.1e}" in str(w.message) for w in found] == [
-        True
-    ] * warned
+    told = [f"terminal equality [1] by {far:.1e}" in str(w.message) for w in found]
+    assert told == [True] * warned
 
 
 def test_of_violations_without_a_tolerance_the_largest_is_told():
