@@ -355,9 +355,9 @@ class Results:
         return f"{words}; precision=64 may get further" if more else words
 
     def optimality_of(self, chain: int) -> str:
-        """What the residual of a chain's plan says, in words, and whether its replay is another."""
-        words = optimality(self, chain)
-        if self.certified_chains[chain] and not self.followed[chain]:
+        """What the residual of a chain says, in words, and if it is small for another motion."""
+        words, small = optimality(self, chain), self.residual[chain] < self.tolerance
+        if small and self.certified_chains[chain] and not self.followed[chain]:
             return f"{words}, of a plan that the replay does not follow"
         return words
 
