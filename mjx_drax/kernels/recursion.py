@@ -9,18 +9,28 @@ threads. Elsewhere an associative scan does the same in about 2 log2(K) rounds.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mjx_drax.kernels import riccati_blocks, riccati_threads
-from mjx_drax.kernels.batching import merged_vmaps, of_one_precision, on_gpu, repeated
+from mjx_drax.kernels import riccati_threads, tiles
+from mjx_drax.kernels.batching import (
+    block_for_each_row,
+    merged_vmaps,
+    of_one_precision,
+    on_gpu,
+    repeated,
+)
 from mjx_drax.kernels.linalg import product
 
 MAX_ENTRIES = 64
 """Entries of F_k or of f_k that one thread keeps in its registers."""
+
+MAX_TILE, WARPS = 64, 4
+"""Rows of F_k that a block of threads keeps in its registers, and its groups of 32 threads."""
 
 
 def step_by_step(F: Array, f: Array) -> Array:
@@ -42,6 +52,25 @@ def in_parallel(F: Array, f: Array) -> Array:
     return jax.lax.associative_scan(compose, (F, f))[1]
 
 
+def by_tiles(F: Array, f: Array, interpret: bool = False) -> Array:
+    """`affine_recursion` of many chains, (chains, K, ...), by a block of threads for each."""
+    chains, K, n, m = f.shape
+    N, M, multiply = tiles.tile(n), tiles.tile(m), tiles.products(interpret)
+
+    def body(F_ref: Any, f_ref: Any, x_ref: Any) -> None:
+        def stage(k: Array, x: Array) -> Array:
+            x = multiply(F_ref[0, k], x) + f_ref[0, k]
+            x_ref[0, k] = x
+            return x
+
+        lax.fori_loop(0, K, stage, jnp.zeros_like(f_ref[0, 0]))
+
+    arrays = tiles.padded(F, N, N), tiles.padded(f, N, M)
+    shapes: dict[str, tuple[int, ...]] = {"x": (chains, K, N, M)}
+    found = block_for_each_row(body, shapes, arrays, WARPS, interpret)
+    return found["x"][..., :n, :m]
+
+
 def _one(F: Array, f: Array) -> Array:
     states: Array = lax.platform_dependent(F, f, cpu=step_by_step, default=in_parallel)
     return states
@@ -54,8 +83,8 @@ def _all_chains(has_rows: Sequence[bool], *arguments: Array) -> Array:
     if on_gpu() and min(n, m) and of_one_precision((F, f)):
         if max(n * n, n * m) <= MAX_ENTRIES:
             kernel = riccati_threads.recursion
-        elif n <= riccati_blocks.MAX_NDX and F.dtype == np.float32:
-            kernel = riccati_blocks.recursion
+        elif n <= MAX_TILE and F.dtype == np.float32:
+            kernel = by_tiles
     if kernel is None:
         return plain(F, f)
     states: Array = lax.platform_dependent(F, f, cuda=kernel, default=plain)

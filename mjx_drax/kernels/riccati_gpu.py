@@ -7,21 +7,22 @@ from functools import update_wrapper
 from typing import Any
 
 import jax
-import numpy as np
-from jax import lax
+from jax import Array, lax
 
-from mjx_drax.kernels import riccati_blocks, riccati_threads
+from mjx_drax.kernels import riccati_cuda, riccati_segments, riccati_threads
 from mjx_drax.kernels.batching import merged_vmaps, of_one_precision, on_gpu, repeated
-from mjx_drax.kernels.riccati_segments import newton_steps, segments
 from mjx_drax.kernels.riccati_threads import Given
+
+Kernel = Callable[[Given], dict[str, Array | None]]
+"""Newton step, noise and feedback of many chains; see `riccati_segments.newton_steps`."""
 
 
 def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
     """Decorator of the Newton step of one chain, whose vmap is kernels where that pays.
 
-    That is on GPUs, in one precision, for blocks that `riccati_threads` serves, and larger ones of
-    float32 as far as `riccati_blocks` goes. The arrays of the step's arguments are, in their order,
-    those of `Given`; it returns result(dx=, du=, noise_x=, noise_u=, rate=, gains=).
+    That is on GPUs, in one precision, for blocks that there is a `kernel_for`. The arrays of the
+    step's arguments are, in their order, those of `Given`; it returns result(dx=, du=, noise_x=,
+    noise_u=, rate=, gains=).
     """
 
     def decorate(newton: Callable[..., Any]) -> Callable[..., Any]:
@@ -29,15 +30,14 @@ def vmapped_as_kernel(result: Callable[..., Any]) -> Callable[[Callable[..., Any
 
         def all_chains(has_rows: tuple[bool, ...], *arguments: Any) -> Any:
             arguments = repeated(has_rows, arguments)
-            kernels = kernels_for(arrays_of(arguments)) if on_gpu() else None
-            if kernels is None:
+            kernel = kernel_for(arrays_of(arguments)) if on_gpu() else None
+            if kernel is None:
                 return plain(*arguments)
 
-            def kernel(*arguments: Any) -> Any:
-                given = arrays_of(arguments)
-                return result(**newton_steps(kernels, given, segments(kernels, given)))
+            def on_cuda(*arguments: Any) -> Any:
+                return result(**kernel(arrays_of(arguments)))
 
-            return lax.platform_dependent(*arguments, cuda=kernel, default=plain)
+            return lax.platform_dependent(*arguments, cuda=on_cuda, default=plain)
 
         return update_wrapper(merged_vmaps(newton, all_chains), newton)
 
@@ -49,14 +49,12 @@ def arrays_of(arguments: Any) -> Given:
     return Given(*jax.tree.leaves(arguments, is_leaf=lambda leaf: leaf is None))
 
 
-def kernels_for(given: Given) -> Any:
-    """The module of kernels that are made for such blocks, or None."""
+def kernel_for(given: Given) -> Kernel | None:
+    """The kernel for such blocks, if there is one."""
     ndx, nu = given.B.shape[-2:]
     there = [array for array in given if array is not None]
     if min(ndx, nu) == 0 or not of_one_precision(there):
         return None
-    for kernels in (riccati_threads, riccati_blocks):
-        if ndx <= kernels.MAX_NDX and nu <= kernels.MAX_NU:
-            of_blocks = kernels is riccati_blocks
-            return kernels if not of_blocks or given.A.dtype == np.float32 else None
-    return None
+    if ndx <= riccati_threads.MAX_NDX and nu <= riccati_threads.MAX_NU:
+        return riccati_segments.newton_steps
+    return riccati_cuda.newton_steps if riccati_cuda.serves(given) else None

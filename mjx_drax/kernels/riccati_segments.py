@@ -1,6 +1,7 @@
 """The Riccati recursion of few chains, parallel in time: segments of stages, then their ends.
 
-A GPU is idle while few chains go through their stages one by one. With K stages in S segments:
+A GPU is idle while few chains of small blocks go through many stages one by one. With K stages in
+S segments:
 
 1. every segment by itself: the value function at its start, for a costate z at its end, is
 
@@ -38,33 +39,39 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from mjx_drax.kernels import riccati_threads as kernels
 from mjx_drax.kernels.riccati_threads import Given
 
+LEAST_STAGES = 256
+"""With fewer stages less is saved than the kernels take to compile."""
 
-def segments(kernels: Any, given: Given) -> int:
-    """In how many segments the kernels go through the stages of every chain."""
-    chains, stages, ndx = given.h.shape
-    limits = kernels.SEGMENTED
-    wanted = min(round(sqrt(2 * stages)), limits.rows // chains)
-    pays = ndx <= limits.ndx and stages >= limits.stages and wanted > 3
+MAX_ROWS = 8192
+"""Segments of all chains at once: more of them wait for each other."""
+
+
+def segments(given: Given) -> int:
+    """In how many segments kernels go through the stages of every chain."""
+    chains, stages, _ = given.h.shape
+    wanted = min(round(sqrt(2 * stages)), MAX_ROWS // chains)
+    pays = stages >= LEAST_STAGES and wanted > 3
     return wanted if pays and given.penalty is not None else 1
 
 
 def newton_steps(
-    kernels: Any, given: Given, count: int = 1, interpret: bool = False
+    given: Given, count: int | None = None, interpret: bool = False
 ) -> dict[str, Array | None]:
     """Newton step, noise and feedback of many chains (in plain JAX: `method.riccati.newton`).
 
     Args:
-        kernels: `riccati_threads` or `riccati_blocks`.
         given: the quadratic programs, a row for each chain.
-        count: the number of segments.
+        count: the number of segments; as `segments` says by default.
         interpret: run it without a GPU.
 
     Returns:
         dx, rate and noise_x (chains, K, ndx), du and noise_u (chains, K, nu), and gains
         (chains, K, nu, ndx); noise_x and noise_u are None without noise.
     """
+    count = count or segments(given)
     if count == 1:
         return kernels.followed(given, kernels.factorized(given, interpret), None, interpret)
     chains, K, _ = given.h.shape
@@ -87,8 +94,8 @@ def newton_steps(
     )
     factors = kernels.factorized(parts, interpret)
     alone = kernels.followed(parts, factors, None, interpret)
-    names = [name for name in ("dx", "noise_x") if alone[name] is not None]
-    ends = jnp.stack([by_chain(alone[name])[:, :, -1] for name in names], axis=-1)
+    last = [a[:, -1] for a in (alone["dx"], alone["noise_x"]) if a is not None]
+    ends = by_chain(jnp.stack(last, axis=-1))
     starts = kernels.recursion(F[:, :-1], ends[:, :-1], interpret)
     starts = by_row(jnp.pad(starts, [(0, 0), (1, 0), (0, 0), (0, 0)]))
     steps = kernels.followed(parts, factors, (starts[..., 0], starts[..., -1]), interpret)

@@ -34,26 +34,15 @@ from mjx_drax.kernels.small_matrices import (
     transpose,
 )
 
-
-class Segmented(NamedTuple):
-    """Up to which ndx, from how many stages on, and for how many rows kernels go in segments."""
-
-    ndx: int
-    stages: int
-    rows: int
-
-
 THREADS = 32
 """Chains that a block of threads works on: one warp."""
 
 READ_AHEAD = 96
 """Numbers of a stage that a thread reads while it works on the stage before."""
 
-SEGMENTED = Segmented(ndx=4, stages=256, rows=8192)
-"""With fewer stages less is saved than the kernels take to compile; larger blocks take minutes."""
-
-MAX_NDX, MAX_NU = 6, 4
-"""Largest blocks that the kernel unrolls; compiling it takes longer than it saves beyond."""
+MAX_NDX, MAX_NU = 4, 4
+"""The largest blocks: of larger ones the kernel takes most of a minute to compile, and longer than
+`riccati_cuda` to run."""
 
 
 class Given(NamedTuple):

@@ -48,41 +48,9 @@ def swept(T: Array, count: int) -> Array:
     return lax.fori_loop(0, count, sweep, T)
 
 
-def rooted(C: Array, count: int) -> Array:
-    """R with R R' = C, lower triangular, for C >= 0 of `count` rows that may be singular.
-
-    Where less is left of a row than rounding makes, its column of R is zero.
-    """
-    rows, columns = indices(C.shape[0])
-    on_diagonal = rows == columns
-    size = jnp.sqrt(jnp.sum(jnp.where(on_diagonal, C, 0.0), axis=1))
-    size = jnp.where(size > 0.0, size, 1.0)
-    least = 4.0 * float(jnp.finfo(C.dtype).eps)
-
-    def column(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        left, R = carry
-        here = jnp.arange(C.shape[0])
-        entries = jnp.sum(jnp.where(columns == k, left, 0.0), axis=1)
-        square = jnp.sum(jnp.where(here == k, entries, 0.0))
-        scale = jnp.where(square > least, lax.rsqrt(jnp.maximum(square, least)), 0.0)
-        entries = jnp.where(here >= k, entries * scale, 0.0)
-        return left - entries[:, None] * entries[None, :], jnp.where(
-            columns == k, entries[:, None], R
-        )
-
-    scaled = C / (size[:, None] * size[None, :])
-    return size[:, None] * lax.fori_loop(0, count, column, (scaled, jnp.zeros_like(C)))[1]
-
-
 def indices(n: int) -> tuple[Array, Array]:
     """The row and the column of every entry of a tile (n, n)."""
     return lax.broadcasted_iota(jnp.int32, (n, n), 0), lax.broadcasted_iota(jnp.int32, (n, n), 1)
-
-
-def diagonal(n: int, dtype: Any) -> Array:
-    """The identity."""
-    rows, columns = indices(n)
-    return jnp.where(rows == columns, jnp.ones((), dtype), jnp.zeros((), dtype))
 
 
 def product(A: Array, B: Array, precision: Any) -> Array:

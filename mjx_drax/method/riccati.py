@@ -26,7 +26,7 @@ affine recursion
 
 that GPUs solve in parallel over time. Shapes: all arrays carry the stage axis K first.
 
-On GPUs kernels do it (`kernels.riccati_gpu`), for few chains in segments (`riccati_segments`).
+On GPUs kernels do it (`kernels.riccati_gpu`).
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Times of the Riccati recursion with noise and gains: its GPU kernels beside the plain recursion.
 
-    python -m mjx_drax.studies.recursion [NDXxNU ...] [--chains N ...] [--knots K]
+    python -m mjx_drax.studies.recursion [NDXxNU ...] [--chains N ...] [--knots K] [--precision P]
 
-A row for each size and number of chains: milliseconds of the plain recursion, of the kernels stage
-by stage and in segments, and the largest difference of the Newton steps, relative to the largest
-entry. Times are medians of calls in one process. The problems are random:
-A = I + 0.1 N / sqrt(ndx), with N standard normal.
+A row for each size and number of chains: milliseconds of the plain recursion and of the kernel, and
+the largest difference of the Newton steps, relative to the largest entry. A call makes ten steps,
+each with defects that the one before has moved, as iterations do; times are medians of calls in one
+process. The problems are random: A = I + 0.1 N / sqrt(ndx), with N standard normal.
 """
 
 from __future__ import annotations
@@ -13,22 +13,26 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array, lax
 
 from mjx_drax.kernels.linalg import full_precision
-from mjx_drax.kernels.riccati_gpu import arrays_of, kernels_for
-from mjx_drax.kernels.riccati_segments import newton_steps, segments
+from mjx_drax.kernels.riccati_gpu import arrays_of, kernel_for
 from mjx_drax.method.model import Linearization, QuadraticCost
 from mjx_drax.method.riccati import White, newton
 
 SIZES = ("4x1", "6x2", "12x4", "24x8", "36x12", "54x21")
 
+STEPS = 10
+"""In one call, so that what a call costs besides does not count."""
 
-def batch(chains: int, K: int, ndx: int, nu: int) -> Any:
+
+def batch(chains: int, K: int, ndx: int, nu: int, dtype: Any = jnp.float32) -> Any:
     """Arguments of `newton` for many chains."""
     rng: Any = np.random.default_rng(0)
     A: Any = np.eye(ndx) + 0.1 * rng.normal(size=(chains, K, ndx, ndx)) / np.sqrt(ndx)
@@ -48,17 +52,28 @@ def batch(chains: int, K: int, ndx: int, nu: int) -> Any:
     white = White(rng.normal(size=(chains, K, nu)), rng.normal(size=(chains, K, ndx)))
     multipliers, penalty = rng.normal(size=(chains, K, ndx)), np.full(chains, 100.0)
     given: Any = Linearization(A, B, h), cost, multipliers, penalty, white
-    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), given)
+    return jax.tree.map(lambda a: jnp.asarray(a, dtype), given)
 
 
-def timed(step: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) -> tuple[float, Any]:
-    """Median seconds of a call, and its result."""
-    out, seconds = jax.block_until_ready(step(*arguments)), []
+def timed(step: Callable[..., Any], given: Any, repeats: int) -> tuple[float, Array]:
+    """Median seconds of a step, which returns dx, noise_x and rate, and the first dx."""
+
+    @jax.jit
+    @full_precision
+    def steps(model: Any, *rest: Any) -> Any:
+        first = step(model, *rest)
+
+        def another(_: Array, found: Any) -> Any:
+            return step(replace(model, h=model.h + 1e-6 * sum(found)), *rest)
+
+        return first, lax.fori_loop(1, STEPS, another, first)
+
+    out, seconds = jax.block_until_ready(steps(*given)), []
     for _ in range(repeats):
         start = time.perf_counter()
-        jax.block_until_ready(step(*arguments))
+        jax.block_until_ready(steps(*given))
         seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds)), out
+    return float(np.median(seconds)) / STEPS, out[0][0]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -67,36 +82,40 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("sizes", nargs="*", default=SIZES, metavar="NDXxNU")
     parser.add_argument("--chains", type=int, nargs="+", default=[1, 32, 1024])
     parser.add_argument("--knots", type=int, default=60)
-    parser.add_argument("--segments", type=int, nargs="*", help="default: as solves choose")
-    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--precision", type=int, choices=(32, 64), default=32)
+    parser.add_argument("--repeats", type=int, default=10)
     options = parser.parse_args(arguments)
-    print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {options.knots} knots\n")
-    print(
-        "| ndx, nu | chains | plain [ms] | by stages [ms] | segments | in segments [ms] | apart |"
-    )
-    print("|---" * 7 + "|")
-    plain = jax.jit(full_precision(jax.vmap(newton.__wrapped__)))
-    for size in options.sizes:
-        ndx, nu = map(int, size.split("x"))
-        for chains in options.chains:
-            programs = batch(chains, options.knots, ndx, nu)
-            given = arrays_of(programs)
-            kernels = kernels_for(given)
-            before, wanted = timed(plain, programs, options.repeats)
-            by_stages, found = timed(steps_in(kernels, 1), (given,), options.repeats)
-            row = f"| {ndx}, {nu} | {chains:,} | {1e3 * before:.3f} | {1e3 * by_stages:.3f}"
-            for count in options.segments or [segments(kernels, given)]:
-                cells = "- | -"
-                if count > 1:
-                    seconds, found = timed(steps_in(kernels, count), (given,), options.repeats)
-                    cells = f"{count} | {1e3 * seconds:.3f}"
-                apart = jnp.max(jnp.abs(found["dx"] - wanted.dx)) / jnp.max(jnp.abs(wanted.dx))
-                print(f"{row} | {cells} | {float(apart):.0e} |", flush=True)
+    device = jax.devices()[0].device_kind
+    print(f"{device}, jax {jax.__version__}, {options.knots} knots, float{options.precision}\n")
+    print("| ndx, nu | chains | plain [ms] | kernel [ms] | apart |\n" + "|---" * 5 + "|")
+    with jax.enable_x64(options.precision == 64):
+        for size in options.sizes:
+            for chains in options.chains:
+                _row(size, chains, options)
 
 
-def steps_in(kernels: Any, count: int) -> Callable[..., Any]:
-    """The kernels' Newton steps in so many segments."""
-    return jax.jit(full_precision(lambda given: newton_steps(kernels, given, count)))
+def _row(size: str, chains: int, options: argparse.Namespace) -> None:
+    ndx, nu = map(int, size.split("x"))
+    dtype = jnp.dtype(f"float{options.precision}")
+    given = batch(chains, options.knots, ndx, nu, dtype)
+    kernel = kernel_for(arrays_of(given))
+
+    def plain(*given: Any) -> tuple[Any, ...]:
+        step = jax.vmap(newton.__wrapped__)(*given)
+        return step.dx, step.noise_x, step.rate
+
+    def by_kernel(*given: Any) -> tuple[Any, ...]:
+        assert kernel is not None
+        step = kernel(arrays_of(given))
+        return step["dx"], step["noise_x"], step["rate"]
+
+    before, wanted = timed(plain, given, options.repeats)
+    cells = "- | -"
+    if kernel is not None:
+        after, found = timed(by_kernel, given, options.repeats)
+        apart = float(jnp.max(jnp.abs(found - wanted)) / jnp.max(jnp.abs(wanted)))
+        cells = f"{1e3 * after:.3f} | {apart:.0e}"
+    print(f"| {ndx}, {nu} | {chains:,} | {1e3 * before:.3f} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_drax.kernels import riccati_blocks, riccati_threads
-from mjx_drax.kernels.recursion import affine_recursion, in_parallel, step_by_step
+from mjx_drax.kernels import riccati_threads
+from mjx_drax.kernels.recursion import affine_recursion, by_tiles, in_parallel, step_by_step
 from mjx_drax.kernels.riccati_threads import THREADS
 
 
@@ -31,7 +31,7 @@ def test_it_is_the_loop(way, K, n, m):
     ("kernel", "chains", "n", "m"),
     [
         (riccati_threads.recursion, THREADS + 3, 2, 3),
-        (riccati_blocks.recursion, 2, 17, 3),
+        (by_tiles, 2, 17, 3),
     ],
 )
 def test_kernels_agree_with_the_loop(kernel, chains, n, m):
