@@ -27,7 +27,7 @@ from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.c_engine.states import differences, integrate, set_state
-from mjx_drax.physics.c_engine.stepper import Spare, Stepper
+from mjx_drax.physics.c_engine.stepper import Spare, Stepper, set_numbers
 from mjx_drax.physics.contacts.collision import left_out
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
 from mjx_drax.physics.contacts.pairs import left_out as pairs_left_out
@@ -349,10 +349,27 @@ class MjxDynamics(Dynamics):
         own: dict[str, np.ndarray] = {}
         if self.numbers is not None and parameters is not None:
             with jax.enable_x64(True):
-                model = jax.tree.map(jnp.asarray, self.in_float64().model)
-                found = jax.vmap(partial(self.numbers, model))(dict(parameters))
+                found = jax.vmap(self._numbers)(dict(parameters))
                 own = {name: np.asarray(values, float) for name, values in found.items()}
         stepper.configure(steps, own)
+
+    @cached_property
+    def _numbers(self) -> Callable[[dict[str, Any]], dict[str, Array]]:
+        """`numbers` of parameters in float64, compiled; to be called where it is enabled."""
+        assert self.numbers is not None
+        with jax.enable_x64(True):
+            model = jax.tree.map(jnp.asarray, self.in_float64().model)
+        return jax.jit(partial(self.numbers, model))
+
+    def of_parameters(self, parameters: Mapping[str, Any]) -> MjxDynamics:
+        """The same with the numbers of parameters in the C engine's model, for use on the host."""
+        if self.numbers is None:
+            return self
+        with jax.enable_x64(True):
+            found = self._numbers(dict(parameters))
+        model = copy(self.mj_model)
+        set_numbers(model, found)
+        return replace(self, mj_model=model)
 
     def host_difference(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """x - y in tangent space by the C engine, (..., ndx), for states (..., nx)."""
@@ -439,12 +456,16 @@ def _flatten_with_keys(dynamics: MjxDynamics) -> tuple[list[tuple[Any, Any]], tu
 jax.tree_util.register_pytree_with_keys(MjxDynamics, _flatten_with_keys, _unflatten, _flatten)
 
 
-def mujoco_model(dynamics: Dynamics) -> mujoco.MjModel | None:
+def mujoco_model(dynamics: Dynamics, x: np.ndarray | None = None) -> mujoco.MjModel | None:
     """The MuJoCo model that dynamics come from; None if they come from a function.
+
+    With a state x (nx,): the model as its parameters make it, where numbers of it are left open.
 
     Here and in `mjx_dynamics` it is asked whether dynamics are MuJoCo's. Not for compiled
     functions, where the model is not known.
     """
+    if x is not None and isinstance(dynamics, Extended):
+        dynamics = dynamics.inner_at(x)
     own = mjx_dynamics(dynamics)
     return None if own is None else own.mj_model
 

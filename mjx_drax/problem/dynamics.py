@@ -156,6 +156,10 @@ class Dynamics:
         """Give every chain of a stepper its time between knots [s] and parameters; None: as are."""
         raise NotImplementedError
 
+    def of_parameters(self, parameters: Mapping[str, Any]) -> Dynamics:
+        """The same with those parameters in what it has on the host; here nothing depends on it."""
+        return self
+
     def times(self, states: np.ndarray, t_init: float) -> np.ndarray:
         """Times of x_0..x_K (K + 1, nx), (K + 1,) [s]."""
         return t_init + float(self.dt) * np.arange(len(states))

@@ -235,18 +235,31 @@ class Extended(Dynamics):
         moved = self.inner.host_integrate(x[..., : self.inner.nx], dx[..., : self.inner.ndx])
         return np.concatenate([moved, x[..., self.inner.nx :] + dx[..., self.inner.ndx :]], axis=-1)
 
+    def inner_at(self, x: np.ndarray) -> Dynamics:
+        """The inner system on the host, with the parameters of a state (nx,)."""
+        return self.inner.of_parameters(self.parameters(np.asarray(self.extras(x).p, float)))
+
     def observe_replayed(self, x: np.ndarray, time: float) -> Any:
         """What goal functions receive: as from the inner system."""
-        return self.inner.observe_replayed(self.inner_state(x), time)
+        return self.observer()(x, time)
 
     def left_out(self, states: np.ndarray) -> tuple[int, str] | None:
         """As of the inner system."""
-        return self.inner.left_out(states[:, : self.inner.nx])
+        return self.inner_at(states[0]).left_out(states[:, : self.inner.nx])
 
     def observer(self) -> Callable[[np.ndarray, float], Any]:
-        """`observe_replayed` for many states, of the inner system."""
-        inner = self.inner.observer()
-        return lambda x, time: inner(self.inner_state(x), time)
+        """`observe_replayed` for many states, of the inner system with their parameters."""
+        last: tuple[Any, Callable[[np.ndarray, float], Any]] = None, self.inner.observer()
+
+        def observe(x: np.ndarray, time: float) -> Any:
+            nonlocal last
+            p = np.asarray(self.extras(x).p)
+            if last[0] is None or not np.array_equal(p, last[0]):
+                inner = self.inner_at(x)
+                last = p, last[1] if inner is self.inner else inner.observer()
+            return last[1](self.inner_state(x), time)
+
+        return observe
 
     def times(self, states: np.ndarray, t_init: float) -> np.ndarray:
         """Times of x'_0..x'_K (K + 1, nx), (K + 1,) [s]."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from mjx_drax import __version__
-from mjx_drax.base.errors import DraxError
+from mjx_drax.base.errors import DraxError, DraxWarning
 from mjx_drax.base.files import complete, file_path, require
-from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.physics.c_engine.stepper import DERIVED
+from mjx_drax.physics.dynamics import mjx_dynamics, mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import Source
 from mjx_drax.problem.problem import Problem
@@ -77,8 +79,8 @@ def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
 
     Keyframe `replay_k` holds time, qpos, qvel, act and ctrl at knot k, after those that the model
     has. Meshes, textures and height fields are copied into a folder beside the file, NAME_assets,
-    so both can be moved together. Other numbers of the model are as MuJoCo writes them, with six
-    digits.
+    so both can be moved together. Other numbers of the model are the file's, as MuJoCo writes them,
+    with six digits: parameters of a problem do not change them.
 
     Args:
         solution: from `solve`, of a problem from an MJCF file or string.
@@ -86,8 +88,18 @@ def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
 
     Raises:
         DraxError: there is no MJCF, it has changed since, or the path cannot be written.
+
+    Warns:
+        DraxWarning: the solution has chosen numbers of the model, or its timestep.
     """
     model, source = mjcf_of(solution.problem)
+    if chosen := _chosen_numbers(solution, model):
+        warnings.warn(
+            f"{path} has the model of the file, where the solution has chosen {chosen}: set it "
+            "there before you replay the keyframes.",
+            DraxWarning,
+            stacklevel=2,
+        )
     target = file_path(path)
     folder = f"{target.stem}_assets"
     before, end, _ = source.in_folder(folder if source.assets else "").xml.rpartition("</mujoco>")
@@ -99,6 +111,21 @@ def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
         text = f"{before}  <keyframe>\n{keys}\n  </keyframe>\n{end}\n"
         partial.write_text(text, encoding="utf-8")
     return target
+
+
+def _chosen_numbers(solution: Solution, model: mujoco.MjModel) -> str:
+    """Which numbers of the model the best chain has otherwise, in words; empty if none."""
+    dynamics, plan = solution.problem.dynamics, solution.plans[solution.best_chain]
+    inner, own = mjx_dynamics(dynamics), mujoco_model(dynamics, plan[0])
+    assert inner is not None
+    assert own is not None
+    arrays = [n for n in dir(model) if isinstance(getattr(model, n, None), np.ndarray)]
+    given = [name for name in arrays if name not in DERIVED]
+    found = [n for n in given if not np.array_equal(getattr(model, n), getattr(own, n))]
+    dt = float(solution.times[1] - solution.times[0]) / inner.substeps
+    if not np.isclose(dt, model.opt.timestep, rtol=1e-5):
+        found.append(f"timestep {dt:.6g} s")
+    return " and ".join(found)
 
 
 def _keys(solution: Solution, model: mujoco.MjModel) -> Iterator[str]:

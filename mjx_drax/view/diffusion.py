@@ -111,7 +111,8 @@ def render_diffusion(
     if seconds is None:
         seconds = _SECONDS + _MORE_SECONDS * (len(np.unique(shown[0].attempt)) - 1)
     width, height = even_size(size)
-    lines, model = outcome_lines(solution, brief=True), mujoco_model(problem.dynamics)
+    lines = outcome_lines(solution, brief=True)
+    model = mujoco_model(problem.dynamics, solution.replayed[0][0])
     moments = frame_moments(shown[0], seconds, fps)
     told = [_caption(solution, shown[0], at) if caption else [] for at in moments]
     lines = lines if caption else []

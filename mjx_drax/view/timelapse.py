@@ -54,8 +54,9 @@ def render_timelapse(
 
     width, height = even_size(size)
     require_whole("count", count)
-    model, which = mujoco_model(solution.problem.dynamics), solution.chain_or_best(chain)
+    which = solution.chain_or_best(chain)
     states = states_of(solution, which, plan)
+    model = mujoco_model(solution.problem.dynamics, states[0])
     if model is None:
         if draw is None:
             raise DraxError(

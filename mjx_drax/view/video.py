@@ -98,7 +98,7 @@ def frames_of(
     states = states_of(solution, chain, plan)
     times = solution.times_of(chain)[: len(states)]
     overlay = outcome_lines(solution, chain, plan, brief=True) if caption else []
-    model = mujoco_model(solution.problem.dynamics)
+    model = mujoco_model(solution.problem.dynamics, states[0])
     if model is not None:
         qpos = states[:, : model.nq]
         look: dict[str, Any] = {"size": size, "camera": camera, "speed": speed}
@@ -128,9 +128,9 @@ def render_comparison(
     """
     problem = solution.problem
     check(problem, fps=fps, size=size, camera=camera, speed=speed, compared=True)
-    model = mujoco_model(problem.dynamics)
-    assert model is not None  # as checked
     chain = solution.chain_or_best(chain)
+    model = mujoco_model(problem.dynamics, solution.plans[chain, 0])
+    assert model is not None  # as checked
     width, height = even_size(size)
     overlay = outcome_lines(solution, chain, brief=True) if caption else []
     overlay[1:1] = ["left: plan, right: replay"] * caption

@@ -26,6 +26,8 @@ from mjx_drax import (
     solve,
     solve_batch,
 )
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.solution.names import state_names
 
 
@@ -215,6 +217,64 @@ def test_a_replay_computes_the_numbers_of_a_model_once():
     assert len(seen) == 1
 
 
+@pytest.mark.parametrize("length", [0.4, 0.9])
+def test_goals_and_pictures_are_of_the_model_that_parameters_make(length):
+    problem = robot(
+        parameters={"length": (0.2, 1.0)},
+        model_numbers=lambda model, p: {"site_pos": model.site_pos.at[0, 2].set(p["length"])},
+        goal=lambda data: data.site("tip").xpos[2] > 0.5,
+        horizon=0.04,
+    )
+    x = np.asarray(problem.x_init, float)
+    x[:2], x[2] = 0.0, length
+    other = x.copy()
+    other[2] = 1.3 - length
+    model = mujoco_model(problem.dynamics, x)
+    data = problem.dynamics.observe_replayed(x, 0.0)
+    assert model.site_pos[0, 2] == pytest.approx(length)
+    assert mujoco_model(problem.dynamics).site_pos[0, 2] != pytest.approx(length)
+    assert data.site("tip").xpos[2] == pytest.approx(length)
+    assert problem.reached(x) == (length > 0.5)
+    expected = [length > 0.5, length < 0.5, length > 0.5]
+    np.testing.assert_array_equal(problem.all_reached(np.array([x, other, x]), [0.0] * 3), expected)
+
+
+def numbered(field, entry, model):
+    """A motion from rest where a number of the model is a parameter, 2.0, and its defects."""
+    problem = robot(
+        model,
+        x_init=[0.0, 0.0],
+        parameters={"p": (0.5, 3.0)},
+        model_numbers=lambda m, p: {field: getattr(m, field).at[entry].set(p["p"])},
+        horizon=0.1,
+    )
+    plan = np.tile([0.0, 0.0, 2.0], (1, 6, 1))
+    states, u = problem.replay(plan, np.ones((1, 5, 1)), np.zeros((1, 5, 1, 3)))
+    start = problem.start_from(jnp.asarray(plan[0, 0], problem.x_init.dtype))
+    knots = Trajectory(jnp.asarray(states[0, 1:]), jnp.asarray(u[0]), start=start)
+    return states[0], np.abs(problem.defects(knots)).max()
+
+
+SLED = """
+<mujoco><option timestep="0.01"/><worldbody>
+  <body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>
+</worldbody><actuator><motor name="pull" joint="x" ctrlrange="-1 1"/></actuator></mujoco>
+"""
+
+
+def test_the_c_engine_takes_no_short_cut_by_what_numbers_were_before():
+    """MuJoCo's compiler keeps the inertia of a sled and where a frame is that of its body."""
+    states, off = numbered("body_mass", 1, SLED)
+    assert states[-1, 1] == pytest.approx(0.1 / 2.0)  # F t / m
+    assert off < 1e-6
+    by_hand = arm().replace('<body name="link">', '<body name="link" simple="false">')
+    states, off = numbered("body_ipos", (1, 0), by_hand)
+    assert states[-1, 1] == pytest.approx(0.1 * (2 * 9.81 * 2.0 + 1) / (2 * 2.0**2), rel=0.02)
+    assert off < 1e-5
+    with pytest.raises(DraxError, match=r'body_ipos.*simple="false"'):
+        numbered("body_ipos", (1, 0), arm())
+
+
 @pytest.mark.slow
 def test_rates_cost_and_are_bounded():
     problem = double_integrator(
@@ -331,7 +391,10 @@ def test_a_changed_model_is_saved_loaded_filmed_and_exported(tmp_path):
     np.testing.assert_array_equal(loaded.times, found.times)
     names = save_csv(loaded, tmp_path / "motion.csv").read_text().splitlines()[0]
     assert names == "time,qpos_elbow,qvel_elbow,mass,step,before_ctrl_torque,ctrl_torque"
-    assert export_keyframes(loaded, tmp_path / "robot.xml").exists()
+    with pytest.warns(DraxWarning, match=r"has chosen body_mass and timestep 0\.0"):
+        export_keyframes(found, tmp_path / "robot.xml")
+    with pytest.warns(DraxWarning, match=r"has chosen timestep 0\.0"):  # functions are not saved
+        assert export_keyframes(loaded, tmp_path / "robot.xml").exists()
     assert render(loaded, tmp_path / "motion.mp4").stat().st_size > 1000
 
 

@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from mjx_drax.base.errors import DraxError
 from mjx_drax.physics.c_engine.states import Floats, converged, quiet
 from mjx_drax.physics.engine import Rollout, mujoco
 
@@ -108,8 +109,7 @@ class Stepper:
         for i, model in enumerate(self._models):
             if timesteps is not None:
                 model.opt.timestep = self._timesteps[i] = timesteps[i]
-            for name, values in numbers.items():
-                getattr(model, name)[...] = values[i].reshape(getattr(model, name).shape)
+            set_numbers(model, {name: values[i] for name, values in numbers.items()})
 
     def __call__(self, u: Floats) -> tuple[Floats, Floats]:
         """The next states (chains, nx) under controls (chains, nu), and the controls applied."""
@@ -136,6 +136,31 @@ class Stepper:
         # The engine resets a state that diverges, and its time: it falls behind
         sound &= now[:, 0] > self._elapsed - 0.5 * self._timesteps
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
+
+
+DERIVED = ("dof_M0", "body_subtreemass", "body_sameframe", "geom_sameframe", "site_sameframe")
+"""What the engine takes in place of the numbers that it follows from, as MJX does not."""
+
+
+def set_numbers(model: mujoco.MjModel, numbers: Mapping[str, Any]) -> None:
+    """Change numbers of a model, by the names of its fields.
+
+    Raises:
+        DraxError: the engine cannot follow them, because of how the model was compiled.
+    """
+    changed = copy(model)
+    for name, values in numbers.items():
+        there = getattr(changed, name)
+        there[...] = np.asarray(values, float).reshape(there.shape)
+    try:
+        mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    except mujoco.FatalError as error:
+        raise DraxError(
+            f"MuJoCo cannot change {' and '.join(numbers)}, which model_numbers returns: {error}. "
+            'Its compiler took a short cut for a body: write simple="false" into its element.'
+        ) from error
+    for name in (*numbers, *DERIVED):
+        getattr(model, name)[...] = getattr(changed, name)
 
 
 def _taken(spare: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:

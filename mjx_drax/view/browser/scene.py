@@ -77,9 +77,9 @@ class ReplayScene:
     """
 
     def __init__(self, server: viser.ViserServer, solution: Solution, poses: int) -> None:
-        model = mujoco_model(solution.problem.dynamics)
-        assert model is not None  # as `require_viewer` checked
         states, controls = solution.replayed
+        model = mujoco_model(solution.problem.dynamics, states[0])
+        assert model is not None  # as `require_viewer` checked
         states = finite(states)
         plan = solution.plans[solution.best_chain].astype(float)
         replayed, planned = motion_of(model, states), motion_of(model, finite(plan))

@@ -212,14 +212,14 @@ def show_natively(solution: Solution, until: threading.Event | None = None) -> N
     Raises:
         DraxError: there is no display, or the problem has no model.
     """
-    model = mujoco_model(solution.problem.dynamics)
+    states, controls = solution.replayed
+    model = mujoco_model(solution.problem.dynamics, states[0])
     if model is None:
         raise DraxError(f"{solution.problem.name} has no MuJoCo model to show: see plot.png.")
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise DraxError("MuJoCo's viewer needs a display, and DISPLAY is not set: leave --native.")
     import mujoco.viewer as native
 
-    states, controls = solution.replayed
     states = finite(states)
     plan = solution.plans[solution.best_chain][:, : model.nq].astype(float)
     times = solution.times_of(solution.best_chain)
