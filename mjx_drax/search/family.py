@@ -120,6 +120,11 @@ class Family:
                 ) from error
 
         first, last = checked(nth(0)), nth(count - 1)
+        if isinstance(last, Problem) and first.horizon != last.horizon:
+            raise DraxError(
+                f"make gives problems of {first.horizon} and {last.horizon} knots: all of a batch "
+                "have one horizon. Vary numbers only, or solve them one by one."
+            )
         leaves, others = jax.tree.leaves(first), jax.tree.leaves(last)
         if len(leaves) != len(others):
             raise DraxError("make gives problems of different structure: vary numbers only.")

@@ -143,7 +143,8 @@ def _apart(solution: Results, first: Optimum, other: Optimum) -> str:
     rounding's size to its side.
     """
     problem, dynamics = solution.problem, solution.problem.dynamics
-    least = FEASIBLE * np.asarray(problem.defect_scale)
+    with problem.arithmetic():
+        least = FEASIBLE * np.asarray(problem.defect_scale)
     here, there = (np.asarray(optimum.trajectory.x) for optimum in (first, other))
     off = dynamics.host_difference(there, here)
     both = dynamics.host_difference(np.concatenate([here, there]), here[:1])

@@ -120,6 +120,10 @@ BATCHES = [
     ("make-none", lambda at: family(None), "make is None"),
     ("make-raises", lambda at: family(fails), "make failed for value 0", "no such sensor"),
     ("make-returns-none", lambda at: family(lambda x: None), "the problem is None"),
+    ("make-horizons",
+     lambda at: solve_batch(
+         lambda n: replace(at.point, horizon=5 + int(n)), np.arange(2), chains=2
+     ), "problems of 5 and 6 knots: all of a batch have one horizon"),
     ("make-constant", lambda at: family(lambda x: at.point), "same problem for every value"),
     ("make-checks-traced", lambda at: family(lambda x: point(x_init=x)),
      "make failed when it was traced", "with_x_init"),

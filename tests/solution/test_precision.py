@@ -1,5 +1,6 @@
 """float64 by one argument, while JAX is set to float32."""
 
+import warnings
 from dataclasses import replace
 
 import jax
@@ -20,6 +21,7 @@ from mjx_drax import (
     solve_batch,
 )
 from mjx_drax.cli import main
+from mjx_drax.solution.report import _apart
 from mjx_drax.view.plotting import plot_solution
 
 pytestmark = [
@@ -93,6 +95,14 @@ def test_a_function_reaches_1e_8(solution):
     assert_double(solution.trajectories, solution.gains, solution.cost, solution.plans)
     assert_double(solution.open_loop.cost, solution.feedback.cost)
     assert jnp.zeros(()).dtype == jnp.float32  # JAX is set as before
+
+
+def test_reports_compare_motions_in_float64(solution):
+    """JAX warns where it shortens a number to float32."""
+    (found,) = solution.optima
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "by +0 at knot" in _apart(solution, found, found)
 
 
 def test_it_is_saved_and_loaded_in_float64(problem, solution, tmp_path):
