@@ -22,7 +22,6 @@ from mjx_drax.base.errors import DraxError
 
 TARGET = "triton_kernel_call_ffi"
 
-
 OLDEST = 80
 """Compute capability from which on GPUs copy to shared memory while they do other work."""
 
