@@ -138,8 +138,18 @@ class Stepper:
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
 
 
-DERIVED = ("dof_M0", "body_subtreemass", "body_sameframe", "geom_sameframe", "site_sameframe")
+DERIVED = (
+    "dof_M0",
+    "body_subtreemass",
+    "body_sameframe",
+    "geom_sameframe",
+    "site_sameframe",
+    "geom_rbound",
+    "geom_aabb",
+)
 """What the engine takes in place of the numbers that it follows from, as MJX does not."""
+
+_PLACES = {"geom_size", "geom_pos", "geom_quat"}
 
 
 def set_numbers(model: mujoco.MjModel, numbers: Mapping[str, Any]) -> None:
@@ -159,8 +169,27 @@ def set_numbers(model: mujoco.MjModel, numbers: Mapping[str, Any]) -> None:
             f"MuJoCo cannot change {' and '.join(numbers)}, which model_numbers returns: {error}. "
             'Its compiler took a short cut for a body: write simple="false" into its element.'
         ) from error
+    if "geom_size" in numbers:
+        _bound(changed)
+    if _PLACES & set(numbers):  # boxes around several geoms of a body are as they were
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     for name in (*numbers, *DERIVED):
         getattr(model, name)[...] = getattr(changed, name)
+
+
+def _bound(model: mujoco.MjModel) -> None:
+    """The spheres and boxes around geoms that have sizes of their own."""
+    kinds = mujoco.mjtGeom
+    for g, (a, b, c) in enumerate(model.geom_size):
+        around = {
+            kinds.mjGEOM_SPHERE: (a, (a, a, a)),
+            kinds.mjGEOM_CAPSULE: (a + b, (a, a, a + b)),
+            kinds.mjGEOM_ELLIPSOID: (max(a, b, c), (a, b, c)),
+            kinds.mjGEOM_CYLINDER: (math.hypot(a, b), (a, a, b)),
+            kinds.mjGEOM_BOX: (math.hypot(a, b, c), (a, b, c)),
+        }.get(kinds(model.geom_type[g]))
+        if around is not None:
+            model.geom_rbound[g], model.geom_aabb[g] = around[0], (0.0, 0.0, 0.0, *around[1])
 
 
 def _taken(spare: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:
