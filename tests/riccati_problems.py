@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_drax.method.model import Linearization, QuadraticCost
+from mjx_drax.method.model import Linearization
 from mjx_drax.method.riccati import White
+from mjx_drax.studies.recursion import of_joint
 
 K, NDX, NU = 3, 3, 2
 
@@ -17,13 +18,7 @@ def batch(chains, dtype, noisy=True, ndx=NDX, soft=True, K=K):
     A, B, h = (rng.normal(size=(chains, K, ndx, *m)) for m in [(ndx,), (NU,), ()])
     half = rng.normal(size=(chains, K + 1, n, n))
     H, g = half @ half.swapaxes(-1, -2) + 0.1 * np.eye(n), rng.normal(size=(chains, K + 1, n))
-    cost = QuadraticCost(
-        g[..., :ndx],
-        g[:, :-1, ndx:],
-        H[..., :ndx, :ndx],
-        H[:, :-1, ndx:, :ndx],
-        H[:, :-1, ndx:, ndx:],
-    )
+    cost = of_joint(H, g, ndx)
     white = White(rng.normal(size=(chains, K, NU)), rng.normal(size=(chains, K, ndx)))
     multipliers, penalties = rng.normal(size=(chains, K, ndx)), np.geomspace(10.0, 1e4, chains)
     penalties = penalties if soft else None

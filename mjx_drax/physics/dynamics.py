@@ -26,8 +26,9 @@ from mjx_drax.kernels.batching import on_gpu
 from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
+from mjx_drax.physics.c_engine.model_numbers import set_numbers
 from mjx_drax.physics.c_engine.states import differences, integrate, set_state
-from mjx_drax.physics.c_engine.stepper import Spare, Stepper, set_numbers
+from mjx_drax.physics.c_engine.stepper import Spare, Stepper
 from mjx_drax.physics.contacts.collision import left_out
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
 from mjx_drax.physics.contacts.pairs import left_out as pairs_left_out

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from mjx_drax.base.errors import DraxError, DraxWarning, require_part, require_positive, shown
 from mjx_drax.physics.actuators import control_ranges, inverse_dynamics, middle_control
 from mjx_drax.physics.agreement.checks import checked_start, examine, require_traceable
+from mjx_drax.physics.c_engine.model_numbers import set_numbers
 from mjx_drax.physics.c_engine.states import stopped_at_once
-from mjx_drax.physics.c_engine.stepper import set_numbers
 from mjx_drax.physics.contacts.pairs import Contacts
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.engine import mujoco
@@ -212,7 +212,7 @@ def from_mjcf(
 
 
 def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]:
-    """The fields of the model that `model_numbers` returns, tried at the bounds.
+    """The fields of the model that `model_numbers` returns, tried between the bounds.
 
     Raises:
         DraxError: it fails, or returns what is no field, has another shape, or is nothing that the
@@ -224,10 +224,11 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
     if not parameters:
         raise DraxError("model_numbers is given without parameters: give parameters=..., or none.")
     shapes, low, high = parameter_ends(parameters)
-    ends = [named(shapes, jnp.asarray(end)) for end in (low, high)]
+    # Not in the middle, where numbers may be what they are without parameters
+    tried = [named(shapes, jnp.asarray(low + part * (high - low))) for part in (0.25, 0.75)]
     give = "a dictionary of fields of mjx.Model, such as {'body_mass': ...}"
     try:
-        found = dict(jax.eval_shape(numbers, dynamics.model, ends[0]))
+        found = dict(jax.eval_shape(numbers, dynamics.model, tried[0]))
     except Exception as error:
         raise DraxError(f"model_numbers failed: {plain(error)}. Return {give}.") from error
     for field, value in found.items():
@@ -238,8 +239,8 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
                 f"model_numbers returned {field!r} of shape {value.shape}, and the model has "
                 f"{shape}: return {give}."
             )
-    for end in ends:
-        set_numbers(copy.copy(dynamics.mj_model), numbers(dynamics.model, end))
+    for parameters in tried:
+        set_numbers(copy.copy(dynamics.mj_model), numbers(dynamics.model, parameters))
     return list(found)
 
 

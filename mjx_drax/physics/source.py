@@ -68,7 +68,7 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
             if is_xml(source):
                 return mujoco.MjModel.from_xml_string(source)
             if not Path(source).is_file():
-                is_folder = Path(source).is_dir() and source
+                is_folder = source != "" and Path(source).is_dir()
                 what = "it is a folder; give a file in it" if is_folder else "check the path"
                 raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
             if is_binary(source):

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from mjx_drax import __version__
 from mjx_drax.base.errors import DraxError, DraxWarning
 from mjx_drax.base.files import complete, file_path, require
-from mjx_drax.physics.c_engine.stepper import DERIVED
+from mjx_drax.physics.c_engine.model_numbers import DERIVED
 from mjx_drax.physics.dynamics import mjx_dynamics, mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import Source

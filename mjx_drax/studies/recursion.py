@@ -32,6 +32,20 @@ STEPS = 10
 """In one call, so that what a call costs besides does not count."""
 
 
+def of_joint(H: Any, g: Any, ndx: int) -> QuadraticCost:
+    """The cost sum_k 1/2 z'H z + g'z of z = (x, u) at K + 1 knots, the last of which has no u.
+
+    H (..., K+1, ndx + nu, ndx + nu) and g (..., K+1, ndx + nu).
+    """
+    return QuadraticCost(
+        g[..., :ndx],
+        g[..., :-1, ndx:],
+        H[..., :ndx, :ndx],
+        H[..., :-1, ndx:, :ndx],
+        H[..., :-1, ndx:, ndx:],
+    )
+
+
 def batch(chains: int, K: int, ndx: int, nu: int, dtype: Any = jnp.float32) -> Any:
     """Arguments of `newton` for many chains."""
     rng: Any = np.random.default_rng(0)
@@ -42,16 +56,9 @@ def batch(chains: int, K: int, ndx: int, nu: int, dtype: Any = jnp.float32) -> A
     H: Any = np.broadcast_to(
         half @ half.swapaxes(1, 2) + 0.1 * np.eye(ndx + nu), (chains, *half.shape)
     )
-    cost = QuadraticCost(
-        g[..., :ndx],
-        g[:, :-1, ndx:],
-        H[..., :ndx, :ndx],
-        H[:, :-1, ndx:, :ndx],
-        H[:, :-1, ndx:, ndx:],
-    )
     white = White(rng.normal(size=(chains, K, nu)), rng.normal(size=(chains, K, ndx)))
     multipliers, penalty = rng.normal(size=(chains, K, ndx)), np.full(chains, 100.0)
-    given: Any = Linearization(A, B, h), cost, multipliers, penalty, white
+    given: Any = Linearization(A, B, h), of_joint(H, g, ndx), multipliers, penalty, white
     return jax.tree.map(lambda a: jnp.asarray(a, dtype), given)
 
 

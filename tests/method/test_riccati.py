@@ -8,6 +8,7 @@ from scipy.linalg import block_diag, solve_discrete_are
 
 from mjx_drax.method.model import Linearization, QuadraticCost
 from mjx_drax.method.riccati import White, factorize, newton, solve_and_sample
+from mjx_drax.studies.recursion import of_joint
 
 K, NDX, NU = 6, 3, 2
 KEY = jax.random.key(0)
@@ -26,10 +27,7 @@ def drawn(seed):
     root = rng.normal(size=(K + 1, NDX + NU, NDX + NU))
     H = root @ root.swapaxes(1, 2) + 0.1 * np.eye(NDX + NU)
     g = rng.normal(size=(K + 1, NDX + NU))
-    cost = QuadraticCost(
-        g[:, :NDX], g[:-1, NDX:], H[:, :NDX, :NDX], H[:-1, NDX:, :NDX], H[:-1, NDX:, NDX:]
-    )
-    return Linearization(A, B, h), cost, rng.normal(size=(K, NDX))
+    return Linearization(A, B, h), of_joint(H, g, NDX), rng.normal(size=(K, NDX))
 
 
 def dense(model, cost):

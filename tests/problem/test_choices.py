@@ -27,6 +27,7 @@ from mjx_drax import (
     solve_batch,
 )
 from mjx_drax.base.errors import DraxWarning
+from mjx_drax.physics.c_engine import stepper
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.solution.names import state_names
 
@@ -273,6 +274,35 @@ def test_the_c_engine_takes_no_short_cut_by_what_numbers_were_before():
     assert off < 1e-5
     with pytest.raises(DraxError, match=r'body_ipos.*simple="false"'):
         numbered("body_ipos", (1, 0), arm())
+
+
+@pytest.mark.parametrize("names", [(), ("mass",)])
+def test_a_replay_gives_every_chain_its_model_once_if_at_all(names, monkeypatch):
+    changed = []
+    monkeypatch.setattr(stepper, "set_numbers", lambda model, *_: changed.append(model))
+    problem = robot(
+        horizon=(0.05, 0.2),
+        knots=5,
+        dt=0.01,
+        parameters=dict.fromkeys(names, (0.5, 3.0)),
+        model_numbers=masses if names else None,
+    )
+    plan = np.tile(np.asarray(problem.x_init, float), (2, 6, 1))
+    problem.replay(plan, np.zeros((2, 5, 1)), np.zeros((2, 5, 1, problem.dynamics.ndx)))
+    assert len(changed) == 2 * len(names)
+
+
+def masses(model, p):
+    return {"body_mass": model.body_mass.at[1].set(p["mass"])}
+
+
+def test_a_chain_whose_numbers_the_engine_cannot_take_leaves_the_others_alone():
+    problem = robot(SLED, x_init=[0.0, 0.0], parameters={"mass": (0.0, 3.0)}, model_numbers=masses)
+    plan = np.tile([0.0, 0.0, 2.0], (2, 6, 1))
+    plan[0, :, 2] = 0.0
+    states, _ = problem.replay(plan, np.ones((2, 5, 1)), np.zeros((2, 5, 1, 3)))
+    assert np.isnan(states[0, 1:, :2]).all()
+    assert states[1, -1, 1] == pytest.approx(0.1 / 2.0)
 
 
 @pytest.mark.slow

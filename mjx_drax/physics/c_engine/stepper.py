@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
+from mjx_drax.physics.c_engine.model_numbers import scratch_of, set_numbers
 from mjx_drax.physics.c_engine.states import Floats, converged, quiet
 from mjx_drax.physics.engine import Rollout, mujoco
 
@@ -106,10 +107,15 @@ class Stepper:
         """Give every chain a timestep [s] (chains,) and numbers of the model (chains, ...)."""
         if not self._own:
             self._models, self._own = [copy(model) for model in self._models], True
+        scratch = scratch_of(self._models[0]) if numbers else None
         for i, model in enumerate(self._models):
             if timesteps is not None:
                 model.opt.timestep = self._timesteps[i] = timesteps[i]
-            set_numbers(model, {name: values[i] for name, values in numbers.items()})
+            if scratch is not None:
+                try:
+                    set_numbers(model, {name: of[i] for name, of in numbers.items()}, scratch)
+                except DraxError:  # as of a mass of zero: other chains go on
+                    self._sound[i] = False
 
     def __call__(self, u: Floats) -> tuple[Floats, Floats]:
         """The next states (chains, nx) under controls (chains, nu), and the controls applied."""
@@ -136,60 +142,6 @@ class Stepper:
         # The engine resets a state that diverges, and its time: it falls behind
         sound &= now[:, 0] > self._elapsed - 0.5 * self._timesteps
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
-
-
-DERIVED = (
-    "dof_M0",
-    "body_subtreemass",
-    "body_sameframe",
-    "geom_sameframe",
-    "site_sameframe",
-    "geom_rbound",
-    "geom_aabb",
-)
-"""What the engine takes in place of the numbers that it follows from, as MJX does not."""
-
-_PLACES = {"geom_size", "geom_pos", "geom_quat"}
-
-
-def set_numbers(model: mujoco.MjModel, numbers: Mapping[str, Any]) -> None:
-    """Change numbers of a model, by the names of its fields.
-
-    Raises:
-        DraxError: the engine cannot follow them, because of how the model was compiled.
-    """
-    changed = copy(model)
-    for name, values in numbers.items():
-        there = getattr(changed, name)
-        there[...] = np.asarray(values, float).reshape(there.shape)
-    try:
-        mujoco.mj_setConst(changed, mujoco.MjData(changed))
-    except mujoco.FatalError as error:
-        raise DraxError(
-            f"MuJoCo cannot change {' and '.join(numbers)}, which model_numbers returns: {error}. "
-            'Its compiler took a short cut for a body: write simple="false" into its element.'
-        ) from error
-    if "geom_size" in numbers:
-        _bound(changed)
-    if _PLACES & set(numbers):  # boxes around several geoms of a body are as they were
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-    for name in (*numbers, *DERIVED):
-        getattr(model, name)[...] = getattr(changed, name)
-
-
-def _bound(model: mujoco.MjModel) -> None:
-    """The spheres and boxes around geoms that have sizes of their own."""
-    kinds = mujoco.mjtGeom
-    for g, (a, b, c) in enumerate(model.geom_size):
-        around = {
-            kinds.mjGEOM_SPHERE: (a, (a, a, a)),
-            kinds.mjGEOM_CAPSULE: (a + b, (a, a, a + b)),
-            kinds.mjGEOM_ELLIPSOID: (max(a, b, c), (a, b, c)),
-            kinds.mjGEOM_CYLINDER: (math.hypot(a, b), (a, a, b)),
-            kinds.mjGEOM_BOX: (math.hypot(a, b, c), (a, b, c)),
-        }.get(kinds(model.geom_type[g]))
-        if around is not None:
-            model.geom_rbound[g], model.geom_aabb[g] = around[0], (0.0, 0.0, 0.0, *around[1])
 
 
 def _taken(spare: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:

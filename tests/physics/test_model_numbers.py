@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax.physics.c_engine.stepper import set_numbers
+from mjx_drax.physics.c_engine.model_numbers import set_numbers
 
 KINDS = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
