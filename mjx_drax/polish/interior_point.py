@@ -47,6 +47,7 @@ from mjx_drax.polish.residual import (
     STILL,
     Residual,
     Scales,
+    is_flat,
     moves_of_start,
     products,
     residual_of,
@@ -413,7 +414,7 @@ def _moved(
         rows=rows,
         funnel=now.funnel,
     )
-    gain = jnp.abs(promised[0]) / scales.cost
+    gain = jnp.where(is_flat(derivatives), 0.0, jnp.abs(promised[0]) / scales.cost)
     done = ok & (jnp.maximum(residual.total, gain) < polish.tolerance)
     alpha, X, parts = line_search(ray, ok & needed & ~done)
     found = ok & (alpha > 0.0)

@@ -11,7 +11,9 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
 and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
 from. The cost is measured by what its slope promises over the motion, sum |dc/du| |u| and a share
-of sum |dc/dx| |x|. So neither units nor constants that are added to it change the residual.
+of sum |dc/dx| |x|. So neither units nor constants that are added to it change the residual. Where
+the cost has no slope at all, as one that is constant, lambda = 0 and v = 0 are right whatever they
+are here: every motion that breaks nothing is an optimum.
 """
 
 from __future__ import annotations
@@ -119,6 +121,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         jnp.stack([(jnp.maximum(p, FIT * b) * moves).max(initial=0.0) for p, b, moves in parts])
     )
     gradient = derivatives.cost
+    flat = is_flat(derivatives)
     of_x, of_u = jnp.sum(jnp.abs(gradient.gx[1:]) * x), jnp.sum(jnp.abs(gradient.gu) * u)
     cost = STILL * terms + STATES * of_x + of_u
     scales = Scales(x, u, terms, cost)
@@ -150,12 +153,18 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         error = jnp.maximum(error, of_slack)
         stationarity = jnp.maximum(stationarity, of_slack / (terms + of_slack))
     return Residual(
-        stationarity,
+        jnp.where(flat, 0.0, stationarity),
         defects,
         jnp.maximum(of_stage.max(initial=0.0), of_end.max(initial=0.0)),
-        gap / cost,
+        jnp.where(flat, 0.0, gap / cost),
         error,
     ), scales
+
+
+def is_flat(derivatives: Derivatives) -> Array:
+    """Whether the cost has no slope anywhere along the motion."""
+    gradient = derivatives.cost
+    return ~((gradient.gx != 0.0).any() | (gradient.gu != 0.0).any())
 
 
 def moves_of_start(E: Array, x: Array) -> Array:

@@ -32,6 +32,9 @@ ALIKE = 0.01
 ON_BOUND = 0.01
 """Share of its range within which an entry is on an end of it."""
 
+BOTTOMLESS = 1e6
+"""A best cost so many times as far below zero as those of initial knots are from it has no end."""
+
 LABEL = 15
 """Characters of a line that name what it is about."""
 
@@ -47,6 +50,7 @@ def lines(solution: Results) -> list[str]:
         found += f" (polish: {counts(solution.polished)})"
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
+    endless = _endless(solution)
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -56,6 +60,7 @@ def lines(solution: Results) -> list[str]:
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
         f"optimality     {solution.optimality}",
+        *([f"               {endless}"] if endless and solution.certified else []),
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
@@ -166,6 +171,20 @@ def _only(solution: Results) -> str:
     )
 
 
+def _endless(solution: Results) -> str:
+    """What there is to say where the cost seems to have no lower bound; else nothing."""
+    first = np.abs(solution.history["cost"][0])
+    least = np.where(np.isnan(solution.cost), np.inf, solution.cost).min()
+    largest = first[np.isfinite(first)].max(initial=0.0)
+    converged = solution.residual[solution.best_chain] < solution.tolerance
+    if converged or largest == 0.0 or not least < -BOTTOMLESS * largest:
+        return ""
+    return (
+        f"the cost fell from about {largest:.2g} to {least:.2g}, as if it had no lower bound: "
+        "bound the controls and states that it rewards, or add a term that grows with them"
+    )
+
+
 def _most_bounded(solution: Results) -> tuple[str, float]:
     """Which entry of the best plan is at an end of its range most often, and at a share of knots.
 
@@ -192,6 +211,8 @@ def _advice(solution: Results) -> str:
     """What to try when no chain could be certified; the shell has the same names."""
     if solution.interrupted:
         return "the solve was interrupted. Let it go on to its end."
+    if endless := _endless(solution):
+        return f"{endless}."
     where = solution.where(solution.best_chain)
     if where is not None:
         told = f"no plan is feasible; the best {where.told(solution.problem)}"

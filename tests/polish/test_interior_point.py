@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import Langevin, Polish, Scale, Trajectory, from_function, from_program
+from mjx_drax import (
+    Langevin,
+    Polish,
+    Scale,
+    Trajectory,
+    from_function,
+    from_program,
+    minimize,
+)
 from mjx_drax.polish.interior_point import projected
 from mjx_drax.polish.residual import slacks_of
 from mjx_drax.search.iterate import Question, begin, iterate, partition
@@ -146,6 +154,39 @@ def test_what_cannot_be_done_is_never_called_optimal(impossible):
     assert not state.polish.optimal
     assert info.residual > 1e-3
     assert info.max_defect > 1e-3
+
+
+@pytest.mark.parametrize("radius", [1.0, pytest.param(9.0, id="out of reach")])
+def test_where_nothing_costs_anything_every_point_that_breaks_nothing_is_an_optimum(radius):
+    problem = from_program(
+        2,
+        cost=lambda x: 3.0 + 0.0 * x[0],
+        equality=lambda x: x @ x - radius**2,
+        inequality=lambda x: x[0] - x[1],
+        bounds=(-2.0, 2.0),
+    )
+    found = minimize(problem, chains=4)
+    near = np.linalg.norm(found.x, axis=1) - radius
+    if radius == 1.0:
+        assert found.status == ["optimal"] * 4
+        np.testing.assert_allclose(near, 0.0, atol=1e-4)
+        assert (found.x[:, 0] < found.x[:, 1] + 1e-4).all()
+    else:
+        assert "optimal" not in found.status
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float64")
+def test_any_motion_is_an_optimum_where_none_costs_anything():
+    free = swing(
+        running_residual=None,
+        terminal_residual=None,
+        running_cost=lambda x, u: 0.0 * u[0] + 2.0,
+        terminal_equality=lambda x: x - jnp.array([0.5, 0.0]),
+    )
+    state, info = polished(free, bare(free), Polish(1e-8, 60))
+    assert state.polish.optimal
+    assert info.max_defect < 1e-8
 
 
 @pytest.mark.slow

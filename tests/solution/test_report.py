@@ -54,6 +54,17 @@ def test_an_infeasible_plan_says_which_bound_it_lies_on():
     assert "10 of 10 knots. Try wider bounds, a longer horizon, or more iterations." in advice
 
 
+def test_a_cost_without_a_lower_bound_is_told():
+    made = made_up(robot())
+    first = {**made.history, "cost": np.array([[20.0, -30.0], [5.0, 5.0]])}
+    for cost, residual, told in ((-1e8, 1.0, True), (-1e8, 1e-6, False), (-1e6, 1.0, False)):
+        costs, residuals = np.full(2, cost, np.float32), np.full(2, residual, np.float32)
+        found = replace(made, cost=costs, residual=residuals, history=first)
+        assert ("the cost fell from about 30 to -1e+08, as if it had no" in str(found)) == told
+    diverged = replace(found, cost=np.full(2, -np.inf), max_defect=np.ones(2, np.float32))
+    assert "to -inf, as if it had no lower bound" in str(diverged).splitlines()[-1]
+
+
 def test_an_infeasible_plan_of_free_duration_is_to_take_longer():
     free = {"horizon": (0.5, 1.0), "knots": 10, "dt": None}
     made = made_up(point(f=lambda x, u, knot: x + knot.dt * u, **free))
