@@ -235,7 +235,9 @@ class compiled:
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
         plain = _config.jax_disable_jit or _config.jax_debug_nans or _config.jax_debug_infs
-        if self._key is None or kept.folder() is None or plain:
+        # Nobody has measured whether a program from the disk still is a graph
+        by_jax = self._key is None or plain or (self._graph and on_gpu())
+        if by_jax or kept.folder() is None:
             return self._by_jax(*arguments, **named)
         if not self._mark._cache_size():  # so jax.clear_caches() has forgotten all programs
             self._programs.clear()
@@ -276,8 +278,6 @@ class compiled:
     def _found(self, every: dict[str, Any], static: dict[str, Any], kinds: Any) -> Any | None:
         """The program for these arguments from the disk, or compiled and kept there."""
         assert self._key is not None
-        if self._graph and jax.default_backend() == "gpu":
-            return None  # nobody has measured whether a program from the disk still is a graph
         key = self._key(**every, **static)
         if key is None:
             return None

@@ -407,7 +407,7 @@ class Problem:
         limits = np.asarray(self.bounds.u_lower, float), np.asarray(self.bounds.u_upper, float)
         plan, u, gains = (np.asarray(given, float) for given in (plan, u, gains))
         with self.arithmetic():
-            knots = self.knots.at(slice(-1)) if knots is None else knots
+            knots = _stages(self) if knots is None else knots
             return self.dynamics.replay(plan, u, gains, limits, knots)
 
     def engine_defects(self, plan: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -427,7 +427,7 @@ class Problem:
         with self.arithmetic():
             which = np.tile(np.arange(self.horizon), len(given) // self.horizon)
             # In numpy, as JAX would compile a program for every number of rows
-            knots = jax.tree.map(lambda a: np.asarray(a)[which, None], self.knots.at(slice(-1)))
+            knots = jax.tree.map(lambda a: np.asarray(a)[which, None], _stages(self))
             ran, _ = dynamics.replay(steps, given, gains, (-free, free), knots)
         off = np.abs(dynamics.host_difference(ran[:, 1], steps[:, 1]))
         return np.nan_to_num(off, nan=np.inf).reshape(*u.shape[:-1], dynamics.ndx)
@@ -659,6 +659,12 @@ def functions_of(
             (f"{before}inequality", constraint.inequality, arguments, None),
         ]
     return [entry for entry in found if entry[1] is not None]
+
+
+@jax.jit
+def _stages(problem: Problem) -> Knot:
+    """The knots of the stages, in one call: on a GPU each operation by itself costs as much."""
+    return problem.knots.at(slice(-1))
 
 
 def _check_guess(problem: Problem) -> None:

@@ -911,9 +911,9 @@ class Search:
             keys = np.stack([replayer.of[rows], rows % replayer.places], axis=1)
 
             def told(shots: Shots) -> None:
-                cost, worst = jnp.asarray(now.info.cost), jnp.asarray(now.info.max_defect)
-                cost, worst = cost.at[rows].set(shots.cost), worst.at[rows].set(shots.broken)
-                info = replace(now.info, cost=cost, max_defect=worst)
+                cost, worst = np.array(now.info.cost), np.array(now.info.max_defect)
+                cost[rows], worst[rows] = shots.cost, shots.broken
+                info = replace(now.info, cost=jnp.asarray(cost), max_defect=jnp.asarray(worst))
                 self._tell(replace(stage, now=replace(now, info=info)), stage.done)
 
             shots, ended = shoot(

@@ -308,20 +308,28 @@ class Family:
             with np.errstate(invalid="ignore"):  # of states that are not finite
                 return np.nan_to_num(np.abs(difference(x, y)).max(axis=(1, 2)), nan=np.inf)
 
-        # Side by side: a replay hardly takes longer with more rows
-        shares = (1.0, *LESS_FEEDBACK) if self.kinked and gains.any() else (1.0,)
-        plans = np.arange(len(u))
-        which = np.tile(plans, len(shares))
-        given = np.concatenate([share * gains for share in shares])
-        states, controls = self.replay(of[which], plan[which], u[which], given)
         way = largest(plan, np.broadcast_to(plan[:, :1], plan.shape))
-        with np.errstate(over="ignore"):  # where a plan stands still and its replay does not
-            off = largest(states, plan[which]) / np.maximum(way, np.finfo(float).tiny)[which]
-        by_share = off.reshape(len(shares), -1)
+
+        def ran(rows: np.ndarray, given: np.ndarray) -> Tracked:
+            states, controls = self.replay(of[rows], plan[rows], u[rows], given)
+            with np.errstate(over="ignore"):  # where a plan stands still and its replay does not
+                off = largest(states, plan[rows]) / np.maximum(way[rows], np.finfo(float).tiny)
+            return Tracked(states, controls, given, off)
+
+        found = ran(np.arange(len(u)), gains)
+        left = np.flatnonzero(found.left)
+        if not (self.kinked and gains.any() and len(left)):
+            return found
+        # The other shares side by side: a replay hardly takes longer with more rows
+        count = len(LESS_FEEDBACK)
+        tried = ran(np.tile(left, count), np.concatenate([s * gains[left] for s in LESS_FEEDBACK]))
+        by_share = np.stack([found.off[left], *np.split(tried.off, count)])
         stays = by_share <= OFF_PLAN
         share = np.where(stays.any(axis=0), stays.argmax(axis=0), by_share.argmin(axis=0))
-        taken = share * len(plans) + plans
-        return Tracked(states[taken], controls[taken], given[taken], off[taken])
+        source = np.arange(len(u))
+        others = len(u) + (share - 1) * len(left) + np.arange(len(left))
+        source[left] = np.where(share > 0, others, left)
+        return Tracked(*(np.concatenate(both)[source] for both in zip(found, tried, strict=True)))
 
     def arrive(self, of: np.ndarray, plans: np.ndarray) -> np.ndarray:
         """`reached`, where plans with one goal that end alike are asked once.

@@ -147,14 +147,20 @@ def between(
 
 
 @jax.jit
-def worst_constraints(own: Question, shared: Question, knots: Trajectory) -> Array:
-    """The largest violation of each row's constraints, whatever its dynamics, (rows,)."""
+def without_dynamics(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
+    """What to judge rows by whose defects come from elsewhere.
 
-    def of_row(q: Question, knots: Trajectory) -> Array:
-        return q.problem.worst_constraint(q.problem.constraints(knots))
+    Returns:
+        The largest violation of each row's constraints (rows,), and its `defect_unit` (rows, ndx).
+    """
 
-    worst: Array = by_row(shared, own, of_row, knots)
-    return worst
+    def of_row(q: Question, knots: Trajectory) -> tuple[Array, Array]:
+        problem = q.problem
+        worst = problem.worst_constraint(problem.constraints(knots))
+        return worst, problem.defect_unit(knots.x)
+
+    both: tuple[Array, Array] = by_row(shared, own, of_row, knots)
+    return both
 
 
 @jax.jit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from mjx_drax.search.iterate import (
     between,
     judged,
     restart_at,
-    worst_constraints,
+    without_dynamics,
 )
 from mjx_drax.search.shooting import Shots
 
@@ -222,12 +221,11 @@ class Replayer:
         which = np.flatnonzero(chosen & ~(defect < FEASIBLE))
         if not (family.kinked and len(which)):
             return info
-        broken = np.asarray(worst_constraints(self.question[1], self.question[0], knots))
+        broken, unit = map(np.asarray, without_dynamics(self.question[1], self.question[0], knots))
         plan, u = self._plans(knots), np.asarray(knots.u)
         for index in np.unique(self.of[which]):
             problem, rows = family.at(int(index)), which[self.of[which] == index]
-            unit = jax.vmap(problem.defect_unit)(knots.x[rows])
-            off = problem.engine_defects(plan[rows], u[rows]) / np.asarray(unit)[:, None]
+            off = problem.engine_defects(plan[rows], u[rows]) / unit[rows, None]
             defect[rows] = np.maximum(off.max(axis=(1, 2)), broken[rows])
         return replace(info, max_defect=jnp.asarray(defect))
 
@@ -236,4 +234,5 @@ def _only(chains: Chains, rows: np.ndarray) -> Chains:
     """The chains; those of other rows with infinitely bad diagnostics."""
     others = np.ones(len(chains.missed), bool)
     others[rows] = False
-    return replace(chains, info=jax.tree.map(partial(jnp.where, others, jnp.inf), chains.info))
+    worst: Info = jax.tree.map(lambda a: np.where(others, np.inf, a), chains.info)
+    return replace(chains, info=worst)

@@ -367,7 +367,7 @@ def test_what_actuators_remember_is_not_taken_from_a_replay_before():
 
 def test_threads_go_by_the_work_of_a_knot(monkeypatch):
     monkeypatch.setattr("mjx_drax.physics.c_engine.stepper.cores", lambda: 16)
-    unknown, light, heavy = (Spare(seconds=s) for s in (np.inf, 5e-5, 1.4e-3))
+    unknown, light, heavy = (Spare(seconds=s) for s in (np.inf, 1.25e-5, 3.5e-4))
     assert [unknown.threads(n) for n in (1, 8, 9, 64, 999)] == [1, 1, 2, 8, 16]
     assert [light.threads(n) for n in (1, 8, 9, 64, 999)] == [1, 1, 2, 8, 16]
     assert [heavy.threads(n) for n in (1, 4, 64)] == [1, 4, 16]

@@ -67,7 +67,8 @@ def stopped_at_once(model: mujoco.MjModel) -> npt.NDArray[np.bool_]:
 
 def set_state(model: mujoco.MjModel, data: mujoco.MjData, x: Floats) -> None:
     """Write x (nx,) into the C engine's data."""
-    data.qpos[:], data.qvel[:], data.act[:] = np.split(x, [model.nq, model.nq + model.nv])
+    nq, nv = model.nq, model.nv
+    data.qpos[:], data.qvel[:], data.act[:] = x[:nq], x[nq : nq + nv], x[nq + nv :]
 
 
 def between(model: mujoco.MjModel, one: Floats, other: Floats) -> Floats:
