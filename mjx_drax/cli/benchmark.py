@@ -42,10 +42,10 @@ def run(options: argparse.Namespace) -> int:
     from mjx_drax.studies.convergence import suite
 
     if options.suite == suite.NAME:
-        suite.run(options.tasks, writable(options.out), say)
+        suite.run(options.tasks, writable(options.out, file="convergence.json"), say)
         return 0
     benchmark.check(options.tasks, options.suite)
-    folder = writable(options.out)
+    folder = writable(options.out, file="benchmark.json")
     say(benchmark.HEADER)
     rows = benchmark.run(
         options.tasks,

@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
     look = pictures.look_of(options)
     if options.video:
         require_drawing(problem, **pictures.without_caption(look))
-    folder = writable(options.out or Path("out") / f"mpc_{problem.name}")
+    folder = writable(options.out or Path("out") / f"mpc_{problem.name}", file="mpc.json")
     tell = say_nothing if options.json else say
     tell(f"{problem.name}: K = {problem.horizon} knots, {options.chains} chains; compiling ...")
     policy.reset(problem.x_init)

@@ -17,7 +17,7 @@ from mjx_drax.physics.c_engine.states import Floats, converged, integrate, set_s
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.source import index
-from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.problem import Problem, require_problem
 
 LASTS = 0.1
 """How long a push lasts [s], unless it says otherwise."""
@@ -77,6 +77,8 @@ class Plant:
         require_not_negative("noise", noise)
         require_not_negative("shaking", shaking)
         require_positive("mass", mass, "a positive factor, 1 for no error")
+        if not isinstance(pushes, Sequence) or isinstance(pushes, str):
+            raise DraxError(f"pushes are {shown(pushes)}: give a list of Push.")
         for push in pushes:
             _require_push(push)
         self.model: mujoco.MjModel = converged(model)
@@ -108,9 +110,19 @@ class Plant:
         return integrate(self.model, self.state, off)
 
     def step(self, u: Floats) -> None:
-        """One physics step under a control (nu,)."""
+        """One physics step under a control (nu,).
+
+        Raises:
+            DraxError: u is no vector (nu,) of finite numbers, of which MuJoCo would start anew.
+        """
         data, model = self.data, self.model
-        data.ctrl[:] = u
+        try:
+            control = numbers(u)
+        except (TypeError, ValueError):
+            control = np.array(np.nan)
+        if control.shape != (model.nu,) or not np.isfinite(control).all():
+            raise DraxError(f"the control u is {shown(u)}: give {model.nu} finite numbers.")
+        data.ctrl[:] = control
         data.xfrc_applied[:] = 0.0
         for push, body in self._pushes:
             if push.time <= self.time + 1e-9 < push.time + push.lasts:
@@ -142,6 +154,7 @@ def _model_of(problem: Problem) -> mujoco.MjModel:
     Raises:
         DraxError: it has none.
     """
+    require_problem(problem)
     model = mujoco_model(problem.dynamics)
     if model is None:
         raise DraxError(

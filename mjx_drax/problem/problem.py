@@ -561,12 +561,17 @@ class Problem:
             return moved if traced else checked(moved)
 
 
-def checked(problem: Problem) -> Problem:
-    """The problem, if sizes, bounds and functions fit together; traced abstractly, not compiled."""
+def require_problem(problem: object) -> None:
+    """Complain about what is no problem."""
     if not isinstance(problem, Problem):
         raise DraxError(
             f"the problem is {shown(problem)}: give one from from_mjcf or from_function."
         )
+
+
+def checked(problem: Problem) -> Problem:
+    """The problem, if sizes, bounds and functions fit together; traced abstractly, not compiled."""
+    require_problem(problem)
     dynamics, name = problem.dynamics, problem.name
     nx, nu = dynamics.nx, dynamics.nu
     if nu < 1:

@@ -27,7 +27,7 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.export import NothingToExport
 from mjx_drax.solution.names import control_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solution import Solution, require_solution
 
 DATASET_FORMAT = 1
 """Of HDF5 files; changes whenever what they hold is named or shaped otherwise."""
@@ -49,6 +49,7 @@ def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
     Raises:
         DraxError: the path cannot be written.
     """
+    require_solution(solution)
     states, controls = solution.replayed
     dynamics = solution.problem.dynamics
     with complete(path, (".csv",)) as partial, partial.open("w", newline="") as file:
@@ -92,6 +93,7 @@ def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
     Warns:
         DraxWarning: the solution has chosen numbers of the model, or its timestep.
     """
+    require_solution(solution)
     model, source = mjcf_of(solution.problem)
     if chosen := _chosen_numbers(solution, model):
         warnings.warn(
@@ -176,7 +178,9 @@ def save_dataset(
     require("h5py", "dataset", "a dataset")
     import h5py
 
-    solutions = [solutions] if isinstance(solutions, Solution) else list(solutions)
+    solutions = list(solutions) if isinstance(solutions, Sequence) else [solutions]
+    for solution in solutions:
+        require_solution(solution)
     tables = [_trajectories(solution, everything) for solution in solutions]
     if not sum(len(table["chain"]) for table in tables):
         raise NothingToExport(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_drax.base.errors import require_whole
+from mjx_drax.base.errors import DraxError, require_whole, shown
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.solution import report, worst
@@ -99,4 +99,12 @@ class Solution(Results):
             gains=gains,
             tolerances=chosen,
             engine=problem.dynamics.engine,
+        )
+
+
+def require_solution(solution: object) -> None:
+    """Complain about what is no answer of a solve, before it is drawn or written."""
+    if not isinstance(solution, Solution):
+        raise DraxError(
+            f"the solution is {shown(solution)}: give what solve or Solution.load has returned."
         )

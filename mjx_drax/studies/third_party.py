@@ -220,6 +220,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", metavar="DIR", help="where third_party.json goes")
     parser.add_argument("--here", type=Path, metavar="FILE", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
+    if options.jobs < 1:
+        parser.error(f"--jobs is {options.jobs}: give a whole number of at least 1")
     if options.here:
         row = measure(options.names[0], options.here, options.chains, options.seed)
         print(json.dumps(row), flush=True)

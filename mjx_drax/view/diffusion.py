@@ -28,7 +28,7 @@ from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.recording import ChainHistory
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solution import Solution, require_solution
 from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
     Frame,
@@ -94,6 +94,7 @@ def render_diffusion(
     Raises:
       DraxError: nothing was recorded, a setting that cannot be used, or neither model nor `draw`.
     """
+    require_solution(solution)
     recording, problem = solution.recording, solution.problem
     if recording is None:
         raise DraxError(

@@ -31,7 +31,7 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.log import residuals
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import Optimum
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solution import Solution, require_solution
 from mjx_drax.view.drawing import Draw
 from mjx_drax.view.labels import control_labels, state_groups
 
@@ -66,6 +66,7 @@ def plot_solution(
     Raises:
         DraxError: the path cannot be written.
     """
+    require_solution(solution)
     times, mode = solution.times, solution.replay_mode
     panels: list[Panel] = []
     if draw is not None:

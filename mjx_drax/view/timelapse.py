@@ -11,7 +11,7 @@ from mjx_drax.base.errors import DraxError, require_whole
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.physics.c_engine.states import interpolated
 from mjx_drax.physics.dynamics import mujoco_model
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solution import Solution, require_solution
 from mjx_drax.view.drawing import Canvas, Draw
 from mjx_drax.view.frames import even_size
 from mjx_drax.view.renderer import open_renderer
@@ -52,6 +52,7 @@ def render_timelapse(
     """
     from PIL import Image
 
+    require_solution(solution)
     width, height = even_size(size)
     require_whole("count", count)
     which = solution.chain_or_best(chain)

@@ -19,7 +19,7 @@ from mjx_drax.physics.c_engine.states import finite, interpolated
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.problem import Problem
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solution import Solution, require_solution
 from mjx_drax.view.drawing import Canvas, Draw, knot_at
 from mjx_drax.view.frames import (
     DARK,
@@ -93,6 +93,7 @@ def frames_of(
     draw: Draw | None = None,
 ) -> Generator[Frame, None, None]:
     """The frames (height, width, 3) uint8 of `render`, whose arguments these are."""
+    require_solution(solution)
     check(solution.problem, fps=fps, size=size, camera=camera, speed=speed, draw=draw)
     chain = solution.chain_or_best(chain)
     states = states_of(solution, chain, plan)
@@ -126,6 +127,7 @@ def render_comparison(
     Raises:
       DraxError: as `render`, or a problem without a model.
     """
+    require_solution(solution)
     problem = solution.problem
     check(problem, fps=fps, size=size, camera=camera, speed=speed, compared=True)
     chain = solution.chain_or_best(chain)

@@ -70,6 +70,11 @@ LOOPS = [
      "force", "nan"),
     ("push-time", lambda at: Plant(at.robot, pushes=[Push("soon", "link", (1, 0, 0))]), "'soon'"),
     ("push-tuple", lambda at: Plant(at.robot, pushes=[(0.0, "link")]), "a push is (0.0, 'link')"),
+    ("pushes", lambda at: Plant(at.robot, pushes=3), "pushes are 3", "list"),
+    ("plant-none", lambda at: Plant(None), "the problem is None"),
+    ("step-nan", lambda at: Plant(at.robot).step([NAN]), "control u is [nan]", "1 finite"),
+    ("step-shape", lambda at: Plant(at.robot).step(np.zeros(3)), "control u", "1 finite"),
+    ("step-none", lambda at: Plant(at.robot).step(None), "control u is None"),
     ("simulate-nan", lambda at: simulate(at.policy, Plant(at.robot), NAN), "duration is nan"),
 ]
 # fmt: on

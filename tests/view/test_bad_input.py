@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from builders import INF, NAN, At, assert_complains, cases, made_up, parts, point
 
-from mjx_drax import render, render_diffusion, render_timelapse, save_html
+from mjx_drax import (
+    render,
+    render_comparison,
+    render_diffusion,
+    render_timelapse,
+    save_html,
+)
 from mjx_drax.view.phase_plots import plot_phase
 from mjx_drax.view.plotting import plot_optima, plot_solution
 from mjx_drax.view.video import render_frames
@@ -28,6 +34,16 @@ PICTURES = [
     ("film-suffix", lambda at: render(at.answer, at.folder / "film.avi"),
      "film.avi", ".mp4", "rename"),
     ("film-none", lambda at: render(at.answer, None), "path is None"),
+    ("film-of-a-problem", lambda at: render(at.robot, at.folder / "a.mp4"),
+     "the solution is <Problem", "Solution.load"),
+    ("comparison-of-none", lambda at: render_comparison(None, at.folder / "a.mp4"),
+     "the solution is None"),
+    ("timelapse-of-none", lambda at: render_timelapse(None, at.folder / "a.png"),
+     "the solution is None"),
+    ("diffusion-of-none", lambda at: render_diffusion(None, at.folder / "a.mp4"),
+     "the solution is None"),
+    ("page-of-none", lambda at: save_html(None, at.folder / "a.html"), "the solution is None"),
+    ("plot-of-none", lambda at: plot_solution(None, at.folder / "a.png"), "the solution is None"),
     ("film-folder",
      lambda at: ((at.folder / "a.mp4").mkdir(), render(at.answer, at.folder / "a.mp4")),
      "folder"),

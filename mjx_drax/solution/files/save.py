@@ -223,11 +223,14 @@ def json_digest(summary: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
-def writable(folder: str | os.PathLike[str], size: int = 1) -> Path:
-    """The folder, made if need be, with room for `size` bytes; call it before long computations."""
+def writable(folder: str | os.PathLike[str], size: int = 1, file: str = ARRAYS) -> Path:
+    """The folder, made if need be, with room for a file of `size` bytes.
+
+    To be called before long computations.
+    """
     path = file_path(folder)
     try:
-        require_room(path / ARRAYS, size)
+        require_room(path / file, size)
     except DraxError as error:
         raise DraxError(f"{error} In the shell: --out DIR.") from error
     return path

@@ -21,7 +21,7 @@ import numpy as np
 
 from mjx_drax.base.errors import require_whole
 from mjx_drax.base.files import complete, file_path
-from mjx_drax.solution.solution import Solution
+from mjx_drax.solution.solution import Solution, require_solution
 from mjx_drax.view.browser.scene import ReplayScene, require_viewer, server_at
 from mjx_drax.view.video import outcome_lines
 
@@ -51,6 +51,7 @@ def save_html(solution: Solution, path: str | os.PathLike[str], poses: int = POS
         DraxError: viser is not installed, the problem has no model, a number of poses below 0, or
             a path that cannot be written.
     """
+    require_solution(solution)
     require_viewer(solution.problem)
     require_whole("poses", poses, 0)
     with complete(path, (".html", ".htm")) as partial:
