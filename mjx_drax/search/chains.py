@@ -138,11 +138,11 @@ class Stage:
 
 
 def slim(chains: Chains) -> Chains:
-    """The chains with knots and gains alone, to save memory."""
+    """The chains with knots, gains and where they died alone, to save memory."""
     state = chains.state
     knots = replace(state.trajectory, slack=None)
     nothing: Any = ()
-    few = State(knots, nothing, nothing, state.gains, nothing, nothing, nothing, nothing)
+    few = State(knots, nothing, nothing, state.gains, nothing, nothing, nothing, state.died_at)
     return replace(chains, state=few)
 
 

@@ -66,6 +66,7 @@ class BatchSolution:
         chain_residual: of the optimality conditions of all chains, NaN if not known, (N, chains).
         tolerance: below which a residual is that of an optimum.
         best: which chain is in x and u, (N,).
+        died_at: iteration at which it turned non-finite and was frozen, else -1, (N,).
         interrupted: whether the solve was ended before its time.
         tolerances: of violations of replays.
         open_loop, feedback: replays of the best chains, over problems.
@@ -83,6 +84,7 @@ class BatchSolution:
     chain_residual: np.ndarray
     tolerance: float
     best: np.ndarray
+    died_at: np.ndarray
     interrupted: bool
     tolerances: Tolerances
     open_loop: Replays
@@ -151,8 +153,8 @@ class BatchSolution:
 
     @property
     def feasible(self) -> np.ndarray:
-        """Whether max|h| < `FEASIBLE`, (N,)."""
-        return self.max_defect < FEASIBLE
+        """Whether max|h| < `FEASIBLE`, and the cost is finite, (N,)."""
+        return (self.max_defect < FEASIBLE) & np.isfinite(self.plan_cost)
 
     @property
     def certified(self) -> np.ndarray:
@@ -169,8 +171,7 @@ class BatchSolution:
     @property
     def status(self) -> list[str]:
         """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, of every problem."""
-        finite = np.isfinite(self.x).all(axis=(1, 2)) & np.isfinite(self.u).all(axis=(1, 2))
-        return statuses(self.feasible, self.optimal, ~finite, self.interrupted)
+        return statuses(self.feasible, self.optimal, self.died_at >= 0, self.interrupted)
 
     def where(self, i: int) -> Violation | None:
         """What keeps problem i from being certified; None if it is.
@@ -298,6 +299,7 @@ def _certified(
         chain_residual=np.reshape(info.residual, shape),
         tolerance=tolerance_of(settings),
         best=best,
+        died_at=np.asarray(state.died_at)[rows],
         interrupted=found.interrupted,
         tolerances=tolerances,
         open_loop=open_loop,

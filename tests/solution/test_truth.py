@@ -123,3 +123,28 @@ def test_an_infeasible_problem_is_not_certified(batch):
     defects = batch.chain_defect.copy()
     defects[1, batch.best[1]] = 1.0
     np.testing.assert_array_equal(replace(batch, chain_defect=defects).certified, [1, 0, 1])
+
+
+def test_a_problem_whose_chains_all_diverge_says_so(batch):
+    died = np.array([-1, 5, 7])
+    cost, defect = batch.chain_cost.copy(), batch.chain_defect.copy()
+    cost[1, batch.best[1]], defect[2, batch.best[2]] = np.nan, 1.0
+    found = replace(batch, died_at=died, chain_cost=cost, chain_defect=defect)
+    assert found.status == [batch.status[0], "diverged", "diverged"]
+    np.testing.assert_array_equal(found.certified, [1, 0, 0])
+    np.testing.assert_array_equal(batch.died_at, -1)
+
+
+def test_of_many_problems_one_may_diverge():
+    edge = from_function(
+        lambda x, u: jnp.where(jnp.abs(x[0]) < 3.0, x + 0.1 * u, jnp.nan),
+        x_init=[0.0, 0.0],
+        nu=2,
+        dt=0.1,
+        horizon=1.0,
+        running_residual=lambda x, u: 0.1 * u,
+    )
+    starts = np.array([[0.0, 0.0], [3.5, 0.0]], np.float32)
+    found = solve_batch(lambda x: replace(edge, x_init=x), starts, chains=2, solver=ONCE)
+    assert found.status == ["feasible", "diverged"]
+    np.testing.assert_array_equal(found.died_at, [-1, 0])
