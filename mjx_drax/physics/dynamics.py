@@ -326,8 +326,13 @@ class MjxDynamics(Dynamics):
     ) -> tuple[np.ndarray, np.ndarray]:
         """States and controls under u_k + K_k (x_k - plan_k) in the C engine; see `Dynamics`.
 
-        All chains take the same knot before any takes the next; see `Stepper`.
+        With feedback all chains take the same knot before any takes the next; see `Stepper`.
         """
+        if not gains.any():
+            K = u.shape[1]
+            with Stepper(self.mj_model, self.substeps, plan[:, 0], self._spare, K) as stepper:
+                states, applied = stepper.run(np.clip(u, *limits))
+            return np.concatenate([plan[:, :1], states], axis=1), applied
         with self.stepper(plan[:, 0]) as stepper:
             return replay_by(
                 lambda k, x, u: stepper(u), self.host_difference, plan, u, gains, limits

@@ -381,6 +381,33 @@ def test_cores_are_those_that_the_process_may_use(monkeypatch):
     assert cores() == 64
 
 
+def test_all_knots_in_one_call_are_the_same_as_one_after_the_other(monkeypatch):
+    d = tasks.load("hopper_jump").make().dynamics
+    rng, chains, K = np.random.default_rng(0), 9, 12
+    x = np.zeros((chains, d.nx)) + 0.02 * rng.standard_normal((chains, d.nx))
+    u = rng.uniform(-1.0, 1.0, (chains, K, d.nu))
+    u[1, 5], u[2, 0], u[3, 7, 0], x[4, 1] = np.nan, np.inf, 1e12, np.nan
+    u[5], x[5, -1] = 0.0, 1e9  # which diverges
+    with d.stepper(x) as stepper:
+        each = [stepper(u[:, k]) for k in range(K)]
+    single = [np.stack(parts, axis=1) for parts in zip(*each, strict=True)]
+    before = np.concatenate([x[:, None], single[0][:, :-1]], axis=1)
+    single[1][~np.isfinite(before).all(axis=2)] = np.nan  # where feedback would have no number
+    lost = np.isnan(single[0]).any(axis=(1, 2))
+    np.testing.assert_array_equal(lost, [0, 1, 1, 1, 1, 1, 0, 0, 0])
+
+    def ran():
+        with Stepper(d.mj_model, d.substeps, x, knots=K) as stepper:
+            return stepper.run(u)
+
+    whole = ran()
+    for one, all_knots in zip(single, whole, strict=True):
+        np.testing.assert_allclose(all_knots, one, atol=1e-9)
+    monkeypatch.setattr("mjx_drax.physics.c_engine.stepper.AT_ONCE", 1)  # chain by chain
+    for again, all_knots in zip(ran(), whole, strict=True):
+        np.testing.assert_array_equal(again, all_knots)
+
+
 def test_a_stepper_learns_how_long_a_knot_takes():
     model, spare = mujoco.MjModel.from_xml_string(SWINGING), Spare()
     with Stepper(model, 3, np.zeros((5, model.nq + model.nv + model.na)), spare) as stepper:

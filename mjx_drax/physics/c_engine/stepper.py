@@ -25,6 +25,12 @@ WORTH_A_THREAD = 1e-4
 CHAINS_PER_THREAD = 8
 """Chains that a thread replays before it is known how long a knot takes."""
 
+CHUNKS = 4
+"""Parts of its share that a thread takes one after the other: none waits long for the slowest."""
+
+AT_ONCE = 2**25
+"""Numbers of physics steps that are held at a time, where many knots are stepped in one call."""
+
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 """What a step of the C engine starts from: time, state, and what actuators and plugins remember."""
 
@@ -36,16 +42,18 @@ class Spare:
     Attributes:
         data: data of the C engine that nothing uses; to make one takes a millisecond or two.
         seconds: that a knot of one chain takes, the shortest seen.
+        model: theirs, `converged`; a copy of one with meshes takes long.
     """
 
     data: list[mujoco.MjData] = field(default_factory=list)
     seconds: float = math.inf
+    model: mujoco.MjModel | None = None
 
-    def threads(self, chains: int) -> int:
-        """How many threads replay so many chains."""
-        wanted = chains / CHAINS_PER_THREAD
+    def threads(self, chains: int, knots: int = 1) -> int:
+        """How many threads replay so many chains, and wait after so many knots."""
+        wanted = chains * knots / CHAINS_PER_THREAD
         if math.isfinite(self.seconds):
-            wanted = chains * self.seconds / WORTH_A_THREAD
+            wanted = chains * knots * self.seconds / WORTH_A_THREAD
         return min(math.ceil(wanted), chains, cores())
 
 
@@ -65,7 +73,12 @@ class Stepper:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, substeps: int, x: Floats, spare: Spare | None = None
+        self,
+        model: mujoco.MjModel,
+        substeps: int,
+        x: Floats,
+        spare: Spare | None = None,
+        knots: int = 1,
     ) -> None:
         """Start at states (chains, nx).
 
@@ -74,14 +87,15 @@ class Stepper:
             substeps: steps for each knot.
             x: states (chains, nx).
             spare: of steppers before; this one's goes there, too.
+            knots: after which threads wait for each other: 1 for calls, K for `run`.
         """
         chains, nx = x.shape
         self.substeps, self._x = substeps, slice(1, 1 + nx)
-        model = converged(model)
+        self._spare = spare = spare or Spare()
+        spare.model = model = converged(model) if spare.model is None else spare.model
         self._models = [model] * chains
         self._own = False
-        self._spare = spare = spare or Spare()
-        self._threads = spare.threads(chains)
+        self._threads = spare.threads(chains, knots)
         self._workers = [_taken(spare.data, model) for _ in range(self._threads)]
         self._start = np.empty(mujoco.mj_stateSize(model, _FULL_PHYSICS))
         mujoco.mj_getState(model, self._workers[0], self._start, _FULL_PHYSICS)
@@ -134,14 +148,55 @@ class Stepper:
             chunk_size=-(-len(u) // self._threads),
             skip_checks=True,
         )
-        took = (time.perf_counter() - began) * self._threads / len(u)
-        self._spare.seconds = min(self._spare.seconds, took)
+        self._took(time.perf_counter() - began, len(u))
         self._now = now = self._steps[:, -1].copy()
         self._elapsed += self.substeps * self._timesteps
         sound &= (np.abs(now) < mujoco.mjMAXVAL).all(axis=1)
         # The engine resets a state that diverges, and its time: it falls behind
         sound &= now[:, 0] > self._elapsed - 0.5 * self._timesteps
         return np.where(sound[:, None], now[:, self._x], np.nan), applied
+
+    def run(self, u: Floats) -> tuple[Floats, Floats]:
+        """The states (chains, K, nx) after each knot under controls (chains, K, nu), and these.
+
+        From where the chains are; nothing can follow. Threads need not wait for each other between
+        knots, and the constraint solver starts from the forces of the step before, which saves it
+        iterations.
+        """
+        (chains, K, _), n = u.shape, self.substeps
+        given = (np.abs(u) < mujoco.mjMAXVAL).all(axis=2)
+        given[:, 0] &= np.isfinite(self._now[:, self._x]).all(axis=1)
+        given = np.logical_and.accumulate(given, axis=1)
+        self._now[~given[:, 0]] = self._start
+        control = np.where(given[..., None], u, 0.0)
+        states = np.empty((chains, K, len(self._start)))
+        few = max(1, AT_ONCE // (K * n * len(self._start)))
+        for rows in (slice(i, i + few) for i in range(0, chains, few)):
+            began, count = time.perf_counter(), len(control[rows])
+            steps = np.empty((count, K * n, len(self._start)))
+            self._engine.rollout(
+                self._models[rows],
+                self._workers,
+                self._now[rows],
+                np.repeat(control[rows], n, axis=1),
+                nstep=K * n,
+                state=steps,
+                chunk_size=max(1, count // (CHUNKS * self._threads)),
+                skip_checks=True,
+            )
+            self._took(time.perf_counter() - began, count * K)
+            states[rows] = steps[:, n - 1 :: n]
+        elapsed = (np.arange(1, K + 1) * n - 0.5) * self._timesteps[:, None]
+        sound = given & (np.abs(states) < mujoco.mjMAXVAL).all(axis=2) & (states[..., 0] > elapsed)
+        sound = np.logical_and.accumulate(sound, axis=1)
+        before = np.concatenate([given[:, :1], given[:, 1:] & sound[:, :-1]], axis=1)
+        x = np.where(sound[..., None], states[..., self._x], np.nan)
+        return x, np.where(before[..., None], u, np.nan)
+
+    def _took(self, seconds: float, knots: int) -> None:
+        """Remember how long a knot of one chain takes."""
+        took = seconds * self._threads / knots
+        self._spare.seconds = min(self._spare.seconds, took)
 
 
 def _taken(spare: list[mujoco.MjData], model: mujoco.MjModel) -> mujoco.MjData:
