@@ -12,8 +12,8 @@ and the residual is the largest of the four. How far a coordinate moves is measu
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
 from. The cost is measured by what its slope promises over the motion, sum |dc/du| |u| and a share
 of sum |dc/dx| |x|. So neither units nor constants that are added to it change the residual. Where
-the cost has no slope at all, as one that is constant, lambda = 0 and v = 0 are right whatever they
-are here: every motion that breaks nothing is an optimum.
+the cost has neither slope nor curvature, as one that is constant, lambda = 0 and v = 0 are right,
+whatever they are here: every motion that breaks nothing is an optimum.
 """
 
 from __future__ import annotations
@@ -162,9 +162,9 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
 
 
 def is_flat(derivatives: Derivatives) -> Array:
-    """Whether the cost has no slope anywhere along the motion."""
-    gradient = derivatives.cost
-    return ~((gradient.gx != 0.0).any() | (gradient.gu != 0.0).any())
+    """Whether the cost has no slope and no curvature anywhere along the motion."""
+    parts = [(part != 0.0).any() for part in jax.tree.leaves(derivatives.cost)]
+    return ~jnp.stack(parts).any()
 
 
 def moves_of_start(E: Array, x: Array) -> Array:

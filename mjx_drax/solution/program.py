@@ -31,6 +31,7 @@ from mjx_drax.search.engine import Progress, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.search.narrowing import Answer, in_a_fitting_box
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.units import to_units
 from mjx_drax.solution.log import history_of, table
@@ -38,7 +39,7 @@ from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
 from mjx_drax.solution.report import INTERRUPTED, counts, html
 from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
-from mjx_drax.solution.violations import Violation, most_broken
+from mjx_drax.solution.violations import Violation, most_broken, warn_of_wide_bounds
 
 
 def from_program(
@@ -221,35 +222,44 @@ def minimize(
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
         raise DraxError(f"{program.name} is a trajectory problem: use mjx_drax.solve.")
-    report = reporting(progress, program.name)
     keep_programs()
     look_again(program)
     program = program.in_precision(precision)
     with program.arithmetic():
-        knots = None if guess is None else _knots(guess, chains, program.dynamics.nu)
+        given = None if guess is None else _knots(guess, chains, program.dynamics.nu)
         settings = settled(program, chains, seed, solver, tolerance, max_iterations)
-        own, mesh = Family.of_one(program), mesh_for(chains)
-        search = Search(own, chains, seed, settings, mesh=mesh, guess=knots)
-        with report as search.progress, said_plainly(f"the solve of {program.name}"):
-            found = search.run()
-        program, state, info = search.family.problem, found.chains.state, found.chains.info
-        _, forces = to_units(program, state.trajectory, state.multipliers, back=True)
-        multipliers = np.asarray(forces.constraints.stage[:, 0])
-        rows = program.constraint.equalities
-        return Minimum(
-            program=program,
-            x=np.asarray(state.trajectory.u[:, 0]),
-            equality=multipliers[:, :rows],
-            inequality=multipliers[:, rows:],
-            cost=np.asarray(info.cost),
-            max_defect=np.asarray(info.max_defect),
-            residual=np.asarray(info.residual),
-            stalled=stalled_of(state),
-            tolerance=tolerance_of(settings),
-            died_at=np.asarray(state.died_at),
-            interrupted=found.interrupted,
-            history=history_of(found),
-        )
+
+        def solved(program: Problem) -> Answer[Minimum]:
+            own, mesh = Family.of_one(program), mesh_for(chains)
+            search = Search(own, chains, seed, settings, mesh=mesh, guess=given)
+            report = reporting(progress, program.name)
+            with report as search.progress, said_plainly(f"the solve of {program.name}"):
+                found = search.run()
+            program, state, info = search.family.problem, found.chains.state, found.chains.info
+            _, forces = to_units(program, state.trajectory, state.multipliers, back=True)
+            multipliers = np.asarray(forces.constraints.stage[:, 0])
+            rows = program.constraint.equalities
+            minimum = Minimum(
+                program=program,
+                x=np.asarray(state.trajectory.u[:, 0]),
+                equality=multipliers[:, :rows],
+                inequality=multipliers[:, rows:],
+                cost=np.asarray(info.cost),
+                max_defect=np.asarray(info.max_defect),
+                residual=np.asarray(info.residual),
+                stalled=stalled_of(state),
+                tolerance=tolerance_of(settings),
+                died_at=np.asarray(state.died_at),
+                interrupted=found.interrupted,
+                history=history_of(found),
+            )
+            best, u = minimum.best_chain, state.trajectory.u
+            cost = float(minimum.cost[best]) if minimum.feasible[best] else np.inf
+            nothing = np.zeros((2, 0))
+            knots = Trajectory(jnp.zeros((1, 0), u.dtype), u[best])
+            return Answer(minimum, program, nothing, knots, cost, found.interrupted)
+
+        return in_a_fitting_box(program, solved, warn_of_wide_bounds)
 
 
 def _knots(guess: ArrayLike, chains: int, size: int) -> Trajectory:

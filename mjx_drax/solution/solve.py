@@ -21,6 +21,7 @@ from mjx_drax.search.engine import Found, Progress, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
+from mjx_drax.search.narrowing import Answer, in_a_fitting_box
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.units import to_units
@@ -30,7 +31,12 @@ from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
-from mjx_drax.solution.violations import Tolerances, as_tolerances, warn_of_loose_ends
+from mjx_drax.solution.violations import (
+    Tolerances,
+    as_tolerances,
+    warn_of_loose_ends,
+    warn_of_wide_bounds,
+)
 
 
 def solve(
@@ -99,7 +105,6 @@ def solve(
     problem = checked(problem)
     if problem.dynamics.nx == 0:
         raise DraxError(f"{problem.name} has no states to replay: use mjx_drax.minimize.")
-    report = reporting(progress, problem.name)
     keep_programs()
     look_again(problem)
     problem = problem.in_precision(precision)
@@ -112,21 +117,49 @@ def solve(
         if record is not None and record.attempts:
             raise DraxError("record is a recorder that has recorded a solve: make another one.")
         given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess
-        search = Search(
-            Family.of_one(problem),
-            chains,
-            seed,
-            settings,
-            mesh=mesh_for(chains, devices),
-            guess=given,
-            checkpoint=None if checkpoint is None else Checkpoint(checkpoint),
-            recorder=record,
-            seconds=math.inf if max_seconds is None else max_seconds,
-        )
-        with report as search.progress, said_plainly(f"the solve of {problem.name}"):
-            found = search.run()
-        solution = _certified(search.family.problem, settings, seed, found, tolerances)
-    return solution if record is None else replace(solution, recording=record.recording())
+        known = Checkpoint(checkpoint) if checkpoint is not None else None
+        most = math.inf if max_seconds is None else max_seconds
+
+        spent = [0.0, 0.0]  # compiling and solving
+
+        def solved(problem: Problem) -> Answer[Solution]:
+            first = spent == [0.0, 0.0]
+            recorder = record if first or record is None else Recorder(record.every)
+            search = Search(
+                Family.of_one(problem),
+                chains,
+                seed,
+                settings,
+                mesh=mesh_for(chains, devices),
+                guess=given,
+                checkpoint=known if first else None,
+                recorder=recorder,
+                seconds=most - spent[1],
+            )
+            report = reporting(progress, problem.name)
+            with report as search.progress, said_plainly(f"the solve of {problem.name}"):
+                found = search.run()
+            spent[:] = spent[0] + found.compile_time, spent[1] + found.solve_time
+            solution = _certified(search.family.problem, settings, seed, found, tolerances)
+            if recorder is not None:
+                solution = replace(solution, recording=recorder.recording())
+            best, more = solution.best_chain, type(record) in (Recorder, type(None))
+            return Answer(
+                solution,
+                solution.problem,
+                solution.plans[best],
+                jax.tree.map(lambda a: a[best], solution.trajectories),
+                float(solution.replay_cost[best]) if solution.certified else math.inf,
+                solution.interrupted or spent[1] >= most or not more,
+            )
+
+        solution = in_a_fitting_box(problem, solved, warn_of_wide_bounds)
+        solution = replace(solution, compile_time=spent[0], solve_time=spent[1])
+        if solution.certified:
+            plans, u = solution.plans.astype(float), np.asarray(solution.trajectories.u)
+            family = Family.of_one(solution.problem)
+            warn_of_loose_ends(family, plans, u, tolerances, solution.best_chain)
+    return solution
 
 
 def warm_of(solution: Solution, problem: Problem, chains: int) -> Warm:
@@ -159,7 +192,7 @@ def _certified(
     family, plan = Family.of_one(problem), np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
     open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
-    solution = Solution(
+    return Solution(
         problem=problem,
         solver=settings,
         seed=seed,
@@ -185,6 +218,3 @@ def _certified(
         solve_time=found.solve_time,
         engine=problem.dynamics.engine,
     )
-    if solution.certified:
-        warn_of_loose_ends(family, plan, u, tolerances, solution.best_chain)
-    return solution

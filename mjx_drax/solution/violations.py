@@ -62,6 +62,9 @@ STILL = 1e-2
 WIDE = 10.0
 """A box that is wider than so many times the motion's extent counts as that wide."""
 
+FEW = 3
+"""So many entries are named."""
+
 NOTHING, LOOSE = 1e-3, 4.0
 """What x_init lacks at the end, in multiples of what is tolerated: nothing, or little, below."""
 
@@ -334,8 +337,25 @@ def warn_of_loose_ends(
                 f"{allowed[entry]:.1e} is tolerated, so its certificate says little: give "
                 f"tolerances=Tolerances({kind}=...), or an x_scatter as wide as the motion.",
                 DraxWarning,
-                stacklevel=4,
+                stacklevel=3,
             )
+
+
+def warn_of_wide_bounds(problem: Problem, which: np.ndarray) -> None:
+    """Warn that bounds of entries (nx + nu,) of states and controls were far too wide."""
+    dynamics = problem.dynamics
+    names, give = [*state_names(dynamics), *control_names(dynamics)], "x_scatter and u_scatter"
+    if not dynamics.nx:  # a program
+        names, give = [f"x[{i}]" for i in range(dynamics.nu)], "a scatter"
+    wide = [name for name, is_wide in zip(names, which, strict=True) if is_wide]
+    more = f" and {len(wide) - FEW} more" if len(wide) > FEW else ""
+    warnings.warn(
+        f"{problem.name} was solved again, from initial knots nearer to the answer, which uses "
+        f"less than a hundredth of the room between the bounds of {', '.join(wide[:FEW])}{more}. "
+        f"Give narrower bounds, or {give}, to solve it once.",
+        DraxWarning,
+        stacklevel=4,
+    )
 
 
 def measured(

@@ -1,0 +1,112 @@
+"""Bounds that are far wider than a motion: its box of initial knots, and what that saves."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders import point, robot
+
+from mjx_drax import from_function, from_program, minimize, solve, tasks
+from mjx_drax.base.errors import DraxWarning
+from mjx_drax.search.narrowing import narrowed
+
+INF = np.inf
+
+
+def motion(x, u):
+    """States x_0..x_10 that move from 0 to x, and controls that are u half of the time."""
+    return np.linspace(0.0, x, 11), np.outer(np.arange(10) % 2, u)
+
+
+def boxes(problem):
+    """Lower and upper sides of states and of controls."""
+    box = problem.scatter
+    return [np.asarray(side).tolist() for side in (box.x_lower, box.x_upper)], [
+        np.asarray(side).tolist() for side in (box.u_lower, box.u_upper)
+    ]
+
+
+def test_a_box_that_no_control_uses_becomes_ten_times_as_wide_as_the_motion():
+    given = point(u_bounds=([-1e3, 0.0], [1e3, 1e4]))
+    problem, which = narrowed(given, given, *motion([1.0, 1.0], [2.0, 0.0]))
+    assert which.tolist() == [False, False, True, True]
+    of_x, of_u = boxes(problem)
+    assert of_x == boxes(given)[0]
+    assert of_u == [[-20.0, 0.0], [20.0, 10.0]]  # what stands still gets a thousandth
+    assert jnp.array_equal(problem.bounds.u_upper, given.bounds.u_upper)
+    again, which = narrowed(given, problem, *motion([1.0, 1.0], [0.1, 0.0]))
+    np.testing.assert_allclose(boxes(again)[1], [[-1.0, 0.0], [1.0, 0.01]], rtol=1e-6)
+
+
+def test_a_box_of_which_something_is_used_stays():
+    x, u = motion([1.0, 1.0], [2.0, 30.0])
+    used = point(u_bounds=([-1e3, -1e3], [1e3, 1e3]))
+    assert narrowed(used, used, x, u) is None
+    given = point(u_bounds=(-1e6, 1e6), u_scatter=(-1e3, 1e3))
+    assert narrowed(given, given, x, u) is None
+    one_sided = point(u_bounds=(0.0, INF))
+    assert narrowed(one_sided, one_sided, x, u) is None
+    by_knot = point(u_bounds=(-1e6 * np.ones((10, 2)), 1e6))
+    assert narrowed(by_knot, by_knot, x, u) is None
+
+
+def test_states_count_from_where_they_start():
+    given = point(x_init=[100.0, -3.0], x_bounds=(-1e4, 1e4))
+    x, u = motion([1.0, 1.0], [0.5, 0.5])
+    problem, which = narrowed(given, given, x + [100.0, -3.0], u)
+    assert which.tolist() == [True, True, False, False]
+    assert boxes(problem)[0] == [[80.0, -23.0], [120.0, 17.0]]
+
+
+def test_where_f_has_kinks_nothing_is_narrower():
+    given = tasks.load("hopper_jump").make()
+    nx, nu = given.dynamics.nx, given.dynamics.nu
+    assert narrowed(given, given, np.zeros((11, nx)), np.zeros((10, nu))) is None
+    assert robot().dynamics.kinked is False
+
+
+def runs(bound, **changes):
+    """A double integrator whose cost is least without force, and whose force may be large."""
+    return from_function(
+        lambda x, u: x + 0.1 * jnp.stack([x[1], u[0]]),
+        **{
+            "x_init": np.zeros(2),
+            "nu": 1,
+            "dt": 0.1,
+            "horizon": 2.0,
+            "running_cost": lambda x, u: (u[0] + 1.0) ** 2,
+            "u_bounds": (0.0, bound),
+            **changes,
+        },
+    )
+
+
+@pytest.mark.parametrize("bound", [1e3, 1e7])
+def test_wide_bounds_do_not_hide_that_a_motion_is_no_optimum(bound):
+    with pytest.warns(DraxWarning, match="solved again.*bounds of u0"):
+        found = solve(runs(bound), chains=4)
+    assert found.optimal
+    assert found.replay_cost[found.best_chain] == pytest.approx(20.0, rel=1e-3)
+    assert float(found.problem.bounds.u_upper[0]) == bound
+
+
+@pytest.mark.slow
+def test_wide_bounds_do_not_hide_that_a_constraint_is_broken():
+    opposed = runs(
+        1.0,
+        x_bounds=(-1e4, 1e4),
+        u_bounds=(-1e3, 1e3),
+        terminal_equality=lambda x: jnp.stack([x[0] - 0.5, x[0] - 0.52]),
+    )
+    with pytest.warns(DraxWarning, match="solved again"):
+        found = solve(opposed, chains=4)
+    assert not found.certified
+
+
+def test_programs_with_wide_bounds_end_at_their_optimum():
+    program = from_program(
+        1, cost=lambda x: x[0] ** 2, inequality=lambda x: 1.5 - x, bounds=(-1e6, 1e6)
+    )
+    with pytest.warns(DraxWarning, match=r"bounds of x\[0\].*narrower bounds, or a scatter"):
+        found = minimize(program, chains=4)
+    assert found.optimal
+    assert found.best[0] == pytest.approx(1.5, rel=1e-3)
