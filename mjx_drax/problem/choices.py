@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from jax import Array
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from mjx_drax.base.errors import DraxError, is_number, require_whole, shown
+from mjx_drax.base.errors import DraxError, DraxWarning, is_number, require_whole, shown
 from mjx_drax.base.numbers import numbers, vector
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.problem.cost import as_partial, takes_knot
@@ -124,6 +125,14 @@ def extend(
         u_init = np.asarray(vector("u_init", choices.u_init))
         if u_init.shape != (dynamics.nu,):
             raise DraxError(f"u_init has shape {u_init.shape}: give {dynamics.nu} numbers.")
+        lower, upper = (np.atleast_2d(e)[0] for e in (bounds.u_lower, bounds.u_upper))
+        if ((u_init < lower) | (u_init > upper)).any():
+            warnings.warn(
+                f"u_init is {u_init.tolist()}, outside of the controls' bounds, so the first rate "
+                "leads back from there: move it, or widen u_bounds.",
+                DraxWarning,
+                stacklevel=5,
+            )
     counts = tuple(count for *_, count in choices.phases)
     whole = Extended(
         inner=dynamics,

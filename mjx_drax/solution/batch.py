@@ -26,6 +26,7 @@ from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.search.narrowing import narrowed
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import (
@@ -40,7 +41,13 @@ from mjx_drax.solution.replay import (
 )
 from mjx_drax.solution.report import counts, html
 from mjx_drax.solution.results import statuses, tolerance_of
-from mjx_drax.solution.violations import Tolerances, Violation, as_tolerances, most_broken
+from mjx_drax.solution.violations import (
+    Tolerances,
+    Violation,
+    as_tolerances,
+    most_broken,
+    warn_of_wide_bounds,
+)
 
 SHARE = 0.5
 """Share of the memory that is free which a chunk may take."""
@@ -289,6 +296,11 @@ def _certified(
     chosen: Trajectory = jax.tree.map(lambda a: np.asarray(a)[rows], state.trajectory)
     plan = np.concatenate([family.starts(np.arange(family.count), chosen)[:, None], x], axis=1)
     open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
+    one = family.at(0)
+    moves = (plan - plan[:, :1]).reshape(-1, plan.shape[2])  # the first is 0
+    wide = narrowed(one, one, moves, u.reshape(-1, u.shape[2]))
+    if wide is not None:
+        warn_of_wide_bounds(one, wide[1], again=False)
     return BatchSolution(
         family=family,
         x=plan,

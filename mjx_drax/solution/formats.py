@@ -179,6 +179,8 @@ def save_dataset(
     import h5py
 
     solutions = list(solutions) if isinstance(solutions, Sequence) else [solutions]
+    if not solutions:
+        raise DraxError("there is no solution to write: give one, or a list of some.")
     for solution in solutions:
         require_solution(solution)
     tables = [_trajectories(solution, everything) for solution in solutions]

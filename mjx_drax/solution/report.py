@@ -214,6 +214,13 @@ def _advice(solution: Results) -> str:
     if endless := _endless(solution):
         return f"{endless}."
     where = solution.where(solution.best_chain)
+    if where is not None and (solution.died_at >= 0).all():
+        first = solution.died_at.min()
+        return (
+            f"every chain would have become infinite or not a number, from iteration {first} on. "
+            "Give bounds, or an x_scatter, of states at which f and the cost have values and "
+            "slopes (1 / x has none at 0)."
+        )
     if where is not None:
         told = f"no plan is feasible; the best {where.told(solution.problem)}"
         of_stage = where.kind in ("equality", "inequality")

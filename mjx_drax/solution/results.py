@@ -267,6 +267,7 @@ class Results:
             what is broken, by how much, in which entry, at which knot; None for a feasible chain.
             Entry and knot are -1 if the defects of a problem that was loaded without f are largest.
         """
+        chain = self.chain_or_best(chain)
         if self.feasible[chain]:
             return None
         plan, u = self.plans[chain].astype(float), np.asarray(self.trajectories.u[chain])

@@ -341,21 +341,29 @@ def warn_of_loose_ends(
             )
 
 
-def warn_of_wide_bounds(problem: Problem, which: np.ndarray) -> None:
-    """Warn that bounds of entries (nx + nu,) of states and controls were far too wide."""
+def warn_of_wide_bounds(problem: Problem, which: np.ndarray, again: bool = True) -> None:
+    """Warn that bounds of entries (nx + nu,) of states and controls were far too wide.
+
+    And that the problem was solved `again` for it, or else what that means.
+    """
     dynamics = problem.dynamics
     names, give = [*state_names(dynamics), *control_names(dynamics)], "x_scatter and u_scatter"
     if not dynamics.nx:  # a program
         names, give = [f"x[{i}]" for i in range(dynamics.nu)], "a scatter"
     wide = [name for name, is_wide in zip(names, which, strict=True) if is_wide]
     more = f" and {len(wide) - FEW} more" if len(wide) > FEW else ""
-    warnings.warn(
+    of = f"{', '.join(wide[:FEW])}{more}"
+    share = f"less than a hundredth of the room between the bounds of {of}"
+    told = (
         f"{problem.name} was solved again, from initial knots nearer to the answer, which uses "
-        f"less than a hundredth of the room between the bounds of {', '.join(wide[:FEW])}{more}. "
-        f"Give narrower bounds, or {give}, to solve it once.",
-        DraxWarning,
-        stacklevel=4,
+        f"{share}. Give narrower bounds, or {give}, to solve it once."
     )
+    if not again:
+        told = (
+            f"motions of {problem.name} use {share}, by which residuals and constraints are "
+            f"measured, so optimal and certified say little. Give narrower bounds, or {give}."
+        )
+    warnings.warn(told, DraxWarning, stacklevel=4)
 
 
 def measured(

@@ -526,6 +526,13 @@ def test_what_a_fixed_problem_cannot_use_is_named():
         robot(knots=10)
 
 
+def test_a_last_control_outside_of_its_bounds_is_told():
+    with pytest.warns(DraxWarning, match=r"u_init is \[5.0\], outside of the controls' bounds"):
+        double_integrator(
+            u_init=[5.0], rates=1, u_bounds=(-1.0, 1.0), running_residual=lambda x, u: u
+        )
+
+
 def test_windows_may_lie_within_the_longest_durations():
     slow = between(lambda x, u: u - 1.0, 4.0, 4.5)
     assert fastest(inequality=slow).horizon == 20

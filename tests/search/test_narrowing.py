@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from builders import point, robot
 
-from mjx_drax import from_function, from_program, minimize, solve, tasks
+from mjx_drax import Langevin, from_function, from_program, minimize, solve, solve_batch, tasks
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.search.narrowing import narrowed
 
@@ -52,7 +52,7 @@ def test_a_box_of_which_something_is_used_stays():
 def test_states_count_from_where_they_start():
     given = point(x_init=[100.0, -3.0], x_bounds=(-1e4, 1e4))
     x, u = motion([1.0, 1.0], [0.5, 0.5])
-    problem, which = narrowed(given, given, x + [100.0, -3.0], u)
+    problem, which = narrowed(given, given, x + np.array([100.0, -3.0]), u)
     assert which.tolist() == [True, True, False, False]
     assert boxes(problem)[0] == [[80.0, -23.0], [120.0, 17.0]]
 
@@ -110,3 +110,9 @@ def test_programs_with_wide_bounds_end_at_their_optimum():
         found = minimize(program, chains=4)
     assert found.optimal
     assert found.best[0] == pytest.approx(1.5, rel=1e-3)
+
+
+def test_a_batch_says_that_its_bounds_are_too_wide():
+    starts = np.array([[0.0, 0.0], [0.5, 0.0]], np.float32)
+    with pytest.warns(DraxWarning, match="say little. Give narrower bounds, or x_scatter"):
+        solve_batch(runs(1e7).with_x_init, starts, chains=2, solver=Langevin(tail=20))

@@ -297,6 +297,8 @@ ANSWERS = [
     ("keyframes-of-none", lambda at: export_keyframes(None, at.folder / "a.xml"),
      "the solution is None"),
     ("dataset-of-none", lambda at: save_dataset(None, at.folder / "a.h5"), "the solution is None"),
+    ("dataset-of-nothing", lambda at: save_dataset([], at.folder / "a.h5"), "no solution to write"),
+    ("where-chain", lambda at: at.answer.where(99), "chain is 99"),
     ("dataset-of-some", lambda at: save_dataset([at.answer, 3], at.folder / "a.h5"),
      "the solution is 3"),
     ("csv-none", lambda at: save_csv(at.answer, None), "path is None"),
@@ -312,7 +314,6 @@ ANSWERS = [
     ("dataset-suffix", lambda at: save_dataset(at.answer, at.folder / "a.csv"), "a.csv", ".h5"),
     ("dataset-uncertified", lambda at: save_dataset(at.uncertified, at.folder / "a.h5"),
      "no chain is certified", "everything=True"),
-    ("dataset-none", lambda at: save_dataset([], at.folder / "a.h5"), "empty"),
 ]
 # fmt: on
 

@@ -65,6 +65,13 @@ def test_a_cost_without_a_lower_bound_is_told():
     assert "to -inf, as if it had no lower bound" in str(diverged).splitlines()[-1]
 
 
+def test_where_all_chains_diverged_more_iterations_are_no_advice():
+    made = replace(made_up(point()), max_defect=np.ones(2, np.float32))
+    lost = str(replace(made, died_at=np.array([7, 3]))).splitlines()[-1]
+    assert "from iteration 3 on. Give bounds, or an x_scatter" in lost
+    assert "Try more iterations" in str(replace(made, died_at=np.array([7, -1])))
+
+
 def test_an_infeasible_plan_of_free_duration_is_to_take_longer():
     free = {"horizon": (0.5, 1.0), "knots": 10, "dt": None}
     made = made_up(point(f=lambda x, u, knot: x + knot.dt * u, **free))
