@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -20,7 +21,7 @@ from mjx_drax.polish.residual import REST
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.chains import CHEAPER
-from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.search.iterate import FEASIBLE, evaluate
 
 AROUND, LEAST = 10.0, 1e-3
 """The new box reaches so many times as far as the motion, and at least this share of the old one:
@@ -135,7 +136,8 @@ def is_better(problem: Problem, knots: Trajectory, cost: float, found: float) ->
         cost: of that; infinite if it is not feasible.
         found: the same of the best chain in the narrower box.
     """
-    feasible = float(problem.max_defect(replace(knots, slack=None))) < FEASIBLE
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], replace(knots, slack=None))
+    feasible = float(evaluate(problem, one).max_defect[0]) < FEASIBLE
     if not feasible and np.isfinite(cost):
         return True  # it was feasible in the units of the wide box alone
     return found < cost - CHEAPER * abs(cost) if np.isfinite(cost) else bool(np.isfinite(found))

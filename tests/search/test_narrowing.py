@@ -57,6 +57,14 @@ def test_states_count_from_where_they_start():
     assert boxes(problem)[0] == [[80.0, -23.0], [120.0, 17.0]]
 
 
+def test_what_is_chosen_for_a_whole_motion_is_not_taken_for_standing_still():
+    given = point(horizon=(0.5, 50.0), knots=10, dt=None, f=lambda x, u, knot: x + knot.dt * u)
+    x, u = motion([1.0, 1.0], [0.5, 0.5])
+    whole = np.tile(np.asarray(given.x_init), (11, 1))
+    whole[:, :2] += x
+    assert narrowed(given, given, whole, u) is None
+
+
 def test_where_f_has_kinks_nothing_is_narrower():
     given = tasks.load("hopper_jump").make()
     nx, nu = given.dynamics.nx, given.dynamics.nu
