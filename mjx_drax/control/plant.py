@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, is_number, require_not_negative, require_positive, shown
 from mjx_drax.base.numbers import numbers
@@ -116,11 +117,8 @@ class Plant:
             DraxError: u is no vector (nu,) of finite numbers, of which MuJoCo would start anew.
         """
         data, model = self.data, self.model
-        try:
-            control = numbers(u)
-        except (TypeError, ValueError):
-            control = np.array(np.nan)
-        if control.shape != (model.nu,) or not np.isfinite(control).all():
+        control = _finite(u, model.nu)
+        if control is None:
             raise DraxError(f"the control u is {shown(u)}: give {model.nu} finite numbers.")
         data.ctrl[:] = control
         data.xfrc_applied[:] = 0.0
@@ -133,14 +131,19 @@ class Plant:
         mujoco.mj_step(model, data)
 
 
+def _finite(value: ArrayLike, size: int) -> Floats | None:
+    """Finite numbers (size,); None for what is something else."""
+    try:
+        found = numbers(value)
+    except (TypeError, ValueError):
+        return None
+    return found if found.shape == (size,) and np.isfinite(found).all() else None
+
+
 def _require_push(push: object) -> None:
     if not isinstance(push, Push):
         raise DraxError(f"a push is {shown(push)}: give a Push(time, body, force).")
-    try:
-        force = numbers(push.force)
-    except (TypeError, ValueError):
-        force = np.array(np.nan)
-    if force.shape != (3,) or not np.isfinite(force).all():
+    if _finite(push.force, 3) is None:
         raise DraxError(f"the force of a push is {shown(push.force)}: give 3 finite numbers [N].")
     if not is_number(push.time) or not is_number(push.lasts) or push.lasts < 0:
         raise DraxError(

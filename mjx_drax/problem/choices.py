@@ -131,7 +131,7 @@ def extend(
                 f"u_init is {u_init.tolist()}, outside of the controls' bounds, so the first rate "
                 "leads back from there: move it, or widen u_bounds.",
                 DraxWarning,
-                stacklevel=5,
+                stacklevel=4,
             )
     counts = tuple(count for *_, count in choices.phases)
     whole = Extended(

@@ -147,8 +147,8 @@ def between(
 
 
 @jax.jit
-def without_dynamics(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
-    """What to judge rows by whose defects come from elsewhere.
+def worst_and_unit(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
+    """What rows are judged by whose defects the replaying engine gives.
 
     Returns:
         The largest violation of each row's constraints (rows,), and its `defect_unit` (rows, ndx).

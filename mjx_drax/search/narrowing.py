@@ -20,7 +20,6 @@ from jax.typing import ArrayLike
 from mjx_drax.polish.residual import REST
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
-from mjx_drax.search.chains import CHEAPER
 from mjx_drax.search.iterate import FEASIBLE, evaluate
 
 AROUND, LEAST = 10.0, 1e-3
@@ -58,6 +57,7 @@ def in_a_fitting_box(
     problem: Problem,
     solved: Callable[[Problem], Answer[Found]],
     told: Callable[[Problem, np.ndarray], None],
+    tolerance: float,
 ) -> Found:
     """What `solved` finds, again and again in a narrower box as long as that is better.
 
@@ -65,17 +65,20 @@ def in_a_fitting_box(
         problem: as given.
         solved: solves it, with this or another box.
         told: called with the problem and the entries (nx + nu,) that got narrower sides, if any.
+        tolerance: on the residual; what is cheaper by this share shows that what it replaces is
+            no optimum.
     """
-    given, answer, narrower = problem, solved(problem), np.zeros(0, bool)
+    given, answer = problem, solved(problem)
+    narrower = np.zeros(problem.dynamics.nx + problem.dynamics.nu, bool)
     for _ in range(BOXES):
         fitting = None if answer.last else narrowed(given, problem, answer.x, answer.knots.u)
         if fitting is None:
             break
         problem, which = fitting
         other = solved(problem)
-        if not is_better(other.problem, answer.knots, answer.cost, other.cost):
+        if not is_better(other.problem, answer.knots, answer.cost, other.cost, tolerance):
             break
-        answer, narrower = other, which | narrower if narrower.size else which
+        answer, narrower = other, narrower | which
     if narrower.any():
         told(given, narrower)
     return answer.found
@@ -127,7 +130,9 @@ def narrowed(
     return replace(problem, scatter=replace(problem.scatter, **sides)), changed
 
 
-def is_better(problem: Problem, knots: Trajectory, cost: float, found: float) -> bool:
+def is_better(
+    problem: Problem, knots: Trajectory, cost: float, found: float, tolerance: float
+) -> bool:
     """Whether what was found in the narrower box takes the place of what was known.
 
     Args:
@@ -135,9 +140,10 @@ def is_better(problem: Problem, knots: Trajectory, cost: float, found: float) ->
         knots: of the best chain that was known, (K, ...).
         cost: of that; infinite if it is not feasible.
         found: the same of the best chain in the narrower box.
+        tolerance: share of the cost by which it must be cheaper.
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], replace(knots, slack=None))
     feasible = float(evaluate(problem, one).max_defect[0]) < FEASIBLE
     if not feasible and np.isfinite(cost):
         return True  # it was feasible in the units of the wide box alone
-    return found < cost - CHEAPER * abs(cost) if np.isfinite(cost) else bool(np.isfinite(found))
+    return found < cost - tolerance * abs(cost) if np.isfinite(cost) else bool(np.isfinite(found))

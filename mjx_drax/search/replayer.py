@@ -20,7 +20,7 @@ from mjx_drax.search.iterate import (
     between,
     judged,
     restart_at,
-    without_dynamics,
+    worst_and_unit,
 )
 from mjx_drax.search.shooting import Shots
 
@@ -221,7 +221,7 @@ class Replayer:
         which = np.flatnonzero(chosen & ~(defect < FEASIBLE))
         if not (family.kinked and len(which)):
             return info
-        broken, unit = map(np.asarray, without_dynamics(self.question[1], self.question[0], knots))
+        broken, unit = map(np.asarray, worst_and_unit(self.question[1], self.question[0], knots))
         plan, u = self._plans(knots), np.asarray(knots.u)
         for index in np.unique(self.of[which]):
             problem, rows = family.at(int(index)), which[self.of[which] == index]

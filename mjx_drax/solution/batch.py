@@ -245,6 +245,9 @@ def solve_batch(
         DraxError: as `solve`; values without a common first axis; a problem with NaN, crossed
             bounds or an x_init outside of them, by its number; a model that varies, which the C
             engine would not replay.
+
+    Warns:
+        DraxWarning: bounds are far wider than all motions, so "optimal" and "certified" say little.
     """
     if chunk is not None:
         require_whole("chunk", chunk)

@@ -218,6 +218,10 @@ def minimize(
     Raises:
         DraxError: sizes that misfit; functions that cannot be differentiated, or are finite, with
             their derivatives, at no initial point.
+
+    Warns:
+        DraxWarning: bounds are far wider than the answer, so the program was solved again from
+            points nearer to it (`search.narrowing`).
     """
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
@@ -259,7 +263,7 @@ def minimize(
             knots = Trajectory(jnp.zeros((1, 0), u.dtype), u[best])
             return Answer(minimum, program, nothing, knots, cost, found.interrupted)
 
-        return in_a_fitting_box(program, solved, warn_of_wide_bounds)
+        return in_a_fitting_box(program, solved, warn_of_wide_bounds, tolerance_of(settings))
 
 
 def _knots(guess: ArrayLike, chains: int, size: int) -> Trajectory:

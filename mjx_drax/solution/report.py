@@ -218,7 +218,7 @@ def _advice(solution: Results) -> str:
         first = solution.died_at.min()
         return (
             f"every chain would have become infinite or not a number, from iteration {first} on. "
-            "Give bounds, or an x_scatter, of states at which f and the cost have values and "
+            "Give bounds, or an x_scatter and a u_scatter, where f and the cost have values and "
             "slopes (1 / x has none at 0)."
         )
     if where is not None:

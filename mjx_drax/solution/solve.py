@@ -101,6 +101,10 @@ def solve(
         DraxError: sizes that misfit, of tolerances too; functions that cannot be differentiated,
             compute something else each time, or are finite, with their derivatives, at no initial
             knot; a checkpoint that cannot be written, is damaged or belongs to another solve.
+
+    Warns:
+        DraxWarning: bounds are far wider than the motion, so the problem was solved again from
+            knots nearer to it (`search.narrowing`); conditions of the end that say little.
     """
     problem = checked(problem)
     if problem.dynamics.nx == 0:
@@ -121,6 +125,7 @@ def solve(
         most = math.inf if max_seconds is None else max_seconds
 
         spent = [0.0, 0.0]  # compiling and solving
+        live = record is not None and type(record) is not Recorder  # it shows one solve
 
         def solved(problem: Problem) -> Answer[Solution]:
             first = spent == [0.0, 0.0]
@@ -143,17 +148,17 @@ def solve(
             solution = _certified(search.family.problem, settings, seed, found, tolerances)
             if recorder is not None:
                 solution = replace(solution, recording=recorder.recording())
-            best, more = solution.best_chain, type(record) in (Recorder, type(None))
+            best = solution.best_chain
             return Answer(
                 solution,
                 solution.problem,
                 solution.plans[best],
                 jax.tree.map(lambda a: a[best], solution.trajectories),
                 float(solution.replay_cost[best]) if solution.certified else math.inf,
-                solution.interrupted or spent[1] >= most or not more,
+                solution.interrupted or spent[1] >= most or live,
             )
 
-        solution = in_a_fitting_box(problem, solved, warn_of_wide_bounds)
+        solution = in_a_fitting_box(problem, solved, warn_of_wide_bounds, tolerance_of(settings))
         solution = replace(solution, compile_time=spent[0], solve_time=spent[1])
         if solution.certified:
             plans, u = solution.plans.astype(float), np.asarray(solution.trajectories.u)

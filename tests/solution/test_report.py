@@ -68,7 +68,7 @@ def test_a_cost_without_a_lower_bound_is_told():
 def test_where_all_chains_diverged_more_iterations_are_no_advice():
     made = replace(made_up(point()), max_defect=np.ones(2, np.float32))
     lost = str(replace(made, died_at=np.array([7, 3]))).splitlines()[-1]
-    assert "from iteration 3 on. Give bounds, or an x_scatter" in lost
+    assert "from iteration 3 on. Give bounds, or an x_scatter and a u_scatter" in lost
     assert "Try more iterations" in str(replace(made, died_at=np.array([7, -1])))
 
 

@@ -67,9 +67,9 @@ def cores() -> int:
 class Stepper:
     """States (chains, nx) that advance together, `substeps` physics steps for each knot.
 
-    The constraint solver converges, whatever the options of the model are; see `CONVERGED`. It
-    starts without a guess at each knot, so that a state depends on the one before and on the
-    control alone. A state that diverges is NaN from then on.
+    The constraint solver converges, whatever the options of the model are; see `CONVERGED`. In a
+    call it starts without a guess, so that a state depends on the one before and on the control
+    alone; `run` takes all knots at once. A state that diverges is NaN from then on.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Stepper:
         """
         (chains, K, _), n = u.shape, self.substeps
         given = (np.abs(u) < mujoco.mjMAXVAL).all(axis=2)
-        given[:, 0] &= np.isfinite(self._now[:, self._x]).all(axis=1)
+        given[:, 0] &= self._sound & np.isfinite(self._now[:, self._x]).all(axis=1)
         given = np.logical_and.accumulate(given, axis=1)
         self._now[~given[:, 0]] = self._start
         control = np.where(given[..., None], u, 0.0)
