@@ -47,6 +47,9 @@ DPI = 150
 MAPS, PANELS = 9, 12
 """Most panels of a figure: optima as the task draws them, coordinates."""
 
+FAR = 100.0
+"""Bounds that are so many times as large as all of a plan are out of the picture."""
+
 _LEAST_WIDTH, _TITLE_HEIGHT = 5.2, 0.8  # of figures, and of the space for their titles [inches]
 
 
@@ -304,9 +307,11 @@ def motion_curves(solution: Solution) -> list[Curves]:
 def _limits(
     plan: np.ndarray, replay: np.ndarray, bounds: Sequence[np.ndarray]
 ) -> tuple[float, float]:
-    """Ends of the vertical axis: plan, finite bounds, and the replay if near."""
-    needed = np.concatenate([np.ravel(a) for a in (plan, *bounds)])
-    needed = needed[np.isfinite(needed)]
+    """Ends of the vertical axis: plan, bounds and replay if near."""
+    planned = plan[np.isfinite(plan)]
+    ends = np.concatenate([np.zeros(0), *map(np.ravel, bounds)])
+    far = FAR * np.abs(planned).max(initial=0.0) or np.inf  # a plan of zeros has all bounds
+    needed = np.concatenate([planned, ends[np.isfinite(ends) & (np.abs(ends) <= far)]])
     low, high = (needed.min(), needed.max()) if needed.size else (-1.0, 1.0)
     span = max(high - low, 1e-3)
     near = np.clip(replay[np.isfinite(replay)], low - span, high + span)

@@ -90,6 +90,14 @@ def test_more_curves_than_colors_are_split() -> None:
 
 
 @pytest.mark.slow
+def test_bounds_far_off_do_not_flatten_the_curves() -> None:
+    plan, wide = np.array([[0.5], [-2.0]]), [np.full((2, 1), end) for end in (-1e3, 1e3)]
+    near = [np.full((2, 1), end) for end in (-20.0, 20.0)]
+    assert max(plotting._limits(plan, plan, wide)) < 1.0
+    assert max(plotting._limits(plan, plan, near)) > 20.0
+    assert max(plotting._limits(0.0 * plan, plan, wide)) > 1e3
+
+
 def test_one_chain(tmp_path: Path) -> None:
     solver = Langevin(iterations=2, tail=0)
     one = solve(load("pendulum").make(), chains=1, solver=solver)
