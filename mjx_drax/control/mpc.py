@@ -202,6 +202,7 @@ class MPC:
         self._applied: Applied | None = None
         self._further = np.asarray(self.problem.x_init)[problem.dynamics.given_nx :]
         self._start: tuple[Carried, Plan] | None = None
+        self._carried: Carried | None = None
         self._lower, self._upper = (
             np.asarray(end, float) for end in (problem.bounds.u_lower, problem.bounds.u_upper)
         )
@@ -261,16 +262,17 @@ class MPC:
         with rarely_collected():
             self._apply(carried, self._state(x), t, 0.0)  # compiles
         self.first_solve = time.perf_counter() - clock
-        self._start = self._carried, self.latest
-        self.statistics = Statistics()
-        return self.latest
+        self._start = self._taken(), self.latest
+        return self.rewind(t)
 
     def rewind(self, t: float = 0.0) -> Plan:
         """Go back to the plan that the last `reset` made, at time t [s], without solving again."""
         if self._start is None:
             raise DraxError("there is nothing to go back to: call policy.reset(x) first.")
         _require_time(t)
-        self._carried, plan = self._start
+        carried, plan = self._start
+        with self.problem.arithmetic():
+            self._carried = jax.tree.map(jnp.copy, carried)  # plans overwrite it
         self._begin(t)
         self._plan, self._time = replace(plan, time=t), t
         self.statistics = Statistics()
@@ -290,7 +292,7 @@ class MPC:
         by = max(0.0, (t - self._time) / float(self.problem.dynamics.dt))
         clock = time.perf_counter()
         with self.problem.arithmetic():
-            plan = self._apply(self._carried, x, t, by)
+            plan = self._apply(self._taken(), x, t, by)
         statistics = self.statistics
         statistics.latencies.append(time.perf_counter() - clock)
         statistics.failed += not plan.finite
@@ -342,6 +344,16 @@ class MPC:
         _require_time(t)
         steps = (t - self.latest.time) / self._step
         return steps > self.every - 1e-6
+
+    def _taken(self) -> Carried:
+        """The chains, which a plan overwrites: they are gone if it does not come to its end."""
+        carried, self._carried = self._carried, None
+        if carried is None:
+            raise DraxError(
+                "the chains are lost, as the last plan was interrupted: call policy.reset(x), or "
+                "policy.rewind()."
+            )
+        return carried
 
     def _apply(self, carried: Carried, x: ArrayLike, t: float, by: float) -> Plan:
         """Plan in one launch, and use it if it is finite."""

@@ -151,7 +151,8 @@ def planner_of(structure: Any, explorers: int) -> compiled:
 
     A call gives their leaves, so that no plan waits while settings and problem are flattened and
     their structure is compared; what is `Now` in one vector; and the problem's data of the knots
-    from now on. The plan comes back in one vector, too.
+    from now on. The plan comes back in one vector, too. What is `Carried` is overwritten: a CUDA
+    graph is told anew where each of its arrays lies, if they lie elsewhere than in the last plan.
     """
 
     def plan(
@@ -173,7 +174,7 @@ def planner_of(structure: Any, explorers: int) -> compiled:
         known = identity((settings, carried, packet, data), settings[-1])
         return known and f"{explorers} explore; {known}"
 
-    return compiled(full_precision(plan), graph=True, key=key)
+    return compiled(full_precision(plan), graph=True, key=key, donate_argnames=("carried",))
 
 
 def now_like(problem: Problem) -> Now:

@@ -157,6 +157,32 @@ def test_a_problem_in_float64_is_planned_for_in_float64():
     assert policy.latest.x.dtype == np.float64
 
 
+def test_going_back_keeps_the_precision_and_gives_the_same_plans():
+    policy = MPC(balance().in_float64(), chains=2, explorers=1, solver=FAST)
+    policy.reset([0.5, 0.0])
+    first = [policy.plan([0.4, 0.1], DT).u, policy.plan([0.3, 0.1], 2 * DT).u]
+    policy.rewind()
+    again = [policy.plan([0.4, 0.1], DT).u, policy.plan([0.3, 0.1], 2 * DT).u]
+    assert again[0].dtype == float
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(*first)
+
+
+def test_a_plan_that_was_interrupted_says_how_to_go_on(policy, monkeypatch):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(policy, "planner", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            policy.plan([0.5, 0.0], DT)
+    with pytest.raises(DraxError, match=r"the last plan was interrupted: call policy.reset\(x\)"):
+        policy.plan([0.5, 0.0], DT)
+    policy.control([0.5, 0.0], DT)
+    policy.rewind()
+    policy.plan([0.5, 0.0], DT)
+
+
 def test_a_shift_by_one_knot_moves_all_that_is_carried():
     problem, flow, key = balance(), FAST.flow, jax.random.key(0)
     states = start(flow, problem, initial_knots(problem, 1, None, key), key)
