@@ -8,7 +8,7 @@ where s_i'(y) is D y, clipped where a contact or a limit opens, y > 0, or where 
 `elliptic_cones` has the s of elliptic friction cones. Without these the function is piecewise
 quadratic: once the constraints that are active stay the same, a full step ends at the minimum;
 before, a shorter one may be better. On GPUs one kernel does all iterations of a row, in a block of
-threads.
+threads: that of `constraints_cuda`, or, with cones, in float32, that of `minima`.
 
 Forces may be larger than what they leave over by more digits than numbers have. So only changes of
 the function are computed, and M a0, which is the sum of all other forces, is never taken from M a.
@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mjx_drax.kernels import constraints_cuda
 from mjx_drax.kernels import elliptic_cones as elliptic
 from mjx_drax.kernels.batching import (
     block_for_each_row,
@@ -34,14 +35,9 @@ from mjx_drax.kernels.batching import (
     on_gpu,
     repeated,
 )
+from mjx_drax.kernels.constraints_cuda import DIGITS, ITERATIONS, SIZES
 from mjx_drax.kernels.linalg import solve_positive, symmetric
 from mjx_drax.kernels.tiles import LEAST, padded, products, swept, tile, times, transposed_times
-
-ITERATIONS, SIZES = 20, 16
-"""Most iterations, and how many step sizes each chooses from, 1, 1/2, 1/4, ..., and one between."""
-
-DIGITS = 32.0
-"""A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
 MOST_ROWS, MOST_WITH_CONES = ((32, 512), (64, 128)), 128
 """Most rows of J, in tiles, for which there is a kernel, up to so many columns; and with cones.
@@ -233,16 +229,12 @@ def _hessian_at(given: Constraints, a: Array) -> Array:
 
 def _all_rows(has_rows: tuple[bool, ...], given: Constraints) -> tuple[Array, Array]:
     given = repeated(has_rows, given)
-    nv = given.a0.shape[-1]
-    most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
-    most = min(most, MOST_WITH_CONES) if given.cones else most
-    fits = _rows(given) <= most and given.M.dtype == np.float32
-    plain = jax.vmap(_plain)
-    if not (on_gpu() and fits and of_one_precision(jax.tree.leaves(given))):
+    plain, by_kernel = jax.vmap(_plain), _kernel_for(given)
+    if by_kernel is None:
         return plain(given)
 
     def kernel(given: Constraints) -> tuple[Array, Array]:
-        a = minima(given)
+        a = by_kernel(given)
         return a, jax.vmap(_hessian_at)(given, a)
 
     found: tuple[Array, Array] = lax.platform_dependent(given, cuda=kernel, default=plain)
@@ -253,8 +245,20 @@ constrained_minimum = merged_vmaps(_plain, _all_rows)
 """The acceleration (nv,), and the Hessian there, (nv, nv)."""
 
 
+def _kernel_for(given: Constraints) -> Callable[[Constraints], Array] | None:
+    """What finds the accelerations of all rows on this GPU; None: arrays do."""
+    if not (on_gpu() and of_one_precision(jax.tree.leaves(given))):
+        return None
+    m, nv = given.J.shape[1:]
+    if not given.cones and constraints_cuda.serves(m, nv, given.J.dtype.itemsize):
+        return lambda given: constraints_cuda.minima(given[:-1])
+    most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
+    most = min(most, MOST_WITH_CONES) if given.cones else most
+    return minima if _rows(given) <= most and given.M.dtype == np.float32 else None
+
+
 def minima(given: Constraints, interpret: bool = False) -> Array:
-    """The accelerations (rows, nv) by the kernel; every array leads with the axis of rows."""
+    """The accelerations (rows, nv) by a kernel; every array leads with the axis of rows."""
     n = given.a0.shape[-1]
     tiles = jax.tree.map(lambda a: padded(a, *map(tile, a.shape[1:])), given._replace(cones=()))
     tiles = tiles._replace(cones=tuple(_tiles(cones, tile(n)) for cones in given.cones))

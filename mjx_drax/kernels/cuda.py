@@ -51,7 +51,7 @@ def call(
     """The results of a kernel.
 
     Args:
-        source: the file.
+        source: the file; it may include the headers that lie beside it.
         kernel: its name in there.
         sizes: macros.
         blocks: of threads.
@@ -64,7 +64,7 @@ def call(
     launcher, capability = _launcher(), _capability()
     assert launcher is not None
     assert capability is not None
-    ptx = compiled(source.read_text(), tuple(f"-D{k}={v}" for k, v in sizes.items()))
+    ptx = compiled(source, tuple(f"-D{k}={v}" for k, v in sizes.items()))
     program = launcher.TritonKernel(kernel, warps, 1, shared, ptx, "", capability)
     pointers = [launcher.create_array_parameter(0, 16)] * (len(arrays) + len(shapes))
     scalars = [launcher.create_scalar_parameter(n, "i32") for n in numbers]
@@ -76,13 +76,18 @@ def call(
 
 
 @cache
-def compiled(source: str, macros: tuple[str, ...]) -> str:
+def compiled(source: Path, macros: tuple[str, ...]) -> str:
     """PTX of a kernel for the GPU of this machine."""
     nvrtc, capability = _nvrtc(), _capability()
     assert nvrtc is not None
     assert capability is not None
-    program, size = c_void_p(), c_size_t()
-    nvrtc.nvrtcCreateProgram(byref(program), source.encode(), b"kernel.cu", 0, None, None)
+    program, size, text = c_void_p(), c_size_t(), source.read_bytes()
+    headers = sorted(source.parent.glob("*.cuh"))
+    texts, names = (
+        (c_char_p * len(headers))(*each)
+        for each in ([h.read_bytes() for h in headers], [h.name.encode() for h in headers])
+    )
+    nvrtc.nvrtcCreateProgram(byref(program), text, b"kernel.cu", len(headers), texts, names)
     architecture = f"--gpu-architecture=compute_{_architecture(nvrtc, capability)}"
     options = [architecture, "--std=c++17", "--ftz=true", *macros]
     given = (c_char_p * len(options))(*(option.encode() for option in options))

@@ -167,7 +167,7 @@ def _machine() -> tuple[Any, ...] | None:
     None if the code was edited after it was loaded: its digest is not that of what runs.
     """
     package = Path(__file__).parents[1]
-    files = sorted([*package.rglob("*.py"), *package.rglob("*.cu")])
+    files = sorted([*package.rglob("*.py"), *package.rglob("*.cu*")])
     if max(max(stat.st_mtime, stat.st_ctime) for stat in map(Path.stat, files)) > _LOADED:
         return None
     code = b"".join(file.read_bytes() for file in files)

@@ -13,44 +13,8 @@
 // Products have the form X'Y, whose rows lie side by side, with symmetric matrices for their
 // transposes; a vector is the first column of a block at the right.
 
-constexpr int BLOCK_SIZE = THREADS < 32 ? 32 : THREADS;
+#include "tiles.cuh"
 
-#ifdef __CUDACC__
-#define DEVICE __device__ __forceinline__
-#define KERNEL __global__ __launch_bounds__(BLOCK_SIZE)
-#define BLOCK blockIdx.x
-#define THREAD threadIdx.x
-#define UNROLL _Pragma("unroll")
-#define UNROLL_SOME _Pragma("unroll 4")
-#define ROLLED _Pragma("unroll 1")
-extern __shared__ __align__(32) REAL MEMORY[];
-DEVICE float inverse_root(float a) { return rsqrtf(a); }
-DEVICE double inverse_root(double a) { return rsqrt(a); }
-DEVICE void sync() {
-  if (THREADS <= 32) __syncwarp();
-  else __syncthreads();
-}
-DEVICE REAL shuffled(REAL a, int by) { return __shfl_xor_sync(0xffffffff, a, by); }
-template <int BYTES>
-DEVICE void copy(REAL* to, const REAL* from) {  // asynchronous: see wait()
-  unsigned int shared = static_cast<unsigned int>(__cvta_generic_to_shared(to));
-  asm volatile("cp.async.ca.shared.global [%0], [%1], %2;" ::"r"(shared), "l"(from), "n"(BYTES)
-               : "memory");
-}
-DEVICE void commit() { asm volatile("cp.async.commit_group;" ::: "memory"); }  // of copies
-template <int NEWER>
-DEVICE void wait() {  // until all groups but so many newer ones have arrived
-  asm volatile("cp.async.wait_group %0;" ::"n"(NEWER) : "memory");
-}
-#endif
-
-struct alignas(TILE * sizeof(REAL)) Line {
-  REAL at[TILE];
-};
-using Tile = REAL[TILE][TILE];
-
-DEVICE constexpr int blocks(int n) { return (n + TILE - 1) / TILE; }
-DEVICE constexpr int triangle(int n) { return n * (n + 1) / 2; }
 constexpr int BX = blocks(NX), BU = blocks(NU), BZ = BX + BU;
 constexpr int PX = BX * TILE, PU = BU * TILE, PZ = BZ * TILE;
 constexpr int SZ = PZ + TILE;  // with a block at the right
@@ -76,39 +40,6 @@ constexpr int F_X = F_TRANSPOSED + SOFT * PX * PX, F_Y = F_X + 2 * PX, F_Z = F_Y
 constexpr int F_U = F_Z + 2 * PX, FORWARD = F_U + 2 * PU;
 constexpr int SHARED = (M_MATRICES + (BACKWARD > FORWARD ? BACKWARD : FORWARD) + 7) / 8 * 8;
 
-// Which tiles of a matrix are in the registers of a thread: the q-th is number thread + q THREADS
-// of a lower triangle of `square` blocks of rows, row by row, and of full rows below it.
-struct Places {
-  int row[EACH], column[EACH];
-
-  DEVICE Places(int square, int thread) {
-    for (int q = 0; q < EACH; ++q) {
-      const int t = thread + q * THREADS, below = t - triangle(square);
-      int r = 0;
-      while (triangle(r + 1) <= t) ++r;
-      row[q] = below < 0 ? r : square + below / square;
-      column[q] = below < 0 ? t - triangle(r) : below % square;
-    }
-  }
-};
-
-#define EACH_TILE(count) \
-  UNROLL                 \
-  for (int q = 0; q < ((count) + THREADS - 1) / THREADS; ++q) if (thread + q * THREADS < (count))
-#define EACH_ENTRY                \
-  UNROLL                          \
-  for (int a = 0; a < TILE; ++a) \
-    UNROLL                        \
-    for (int b = 0; b < TILE; ++b)
-
-DEVICE void write_line(REAL* to, const REAL (&row)[TILE]) {
-  Line found;
-  UNROLL
-  for (int b = 0; b < TILE; ++b) found.at[b] = row[b];
-  *reinterpret_cast<Line*>(to) = found;
-}
-DEVICE Line line(const REAL* at) { return *reinterpret_cast<const Line*>(at); }
-
 // c += X'Y of so many rows, for the columns at X and at Y.
 template <int STRIDE_X, int STRIDE_Y>
 DEVICE void add_product(Tile& c, const REAL* X, const REAL* Y, int rows) {
@@ -128,113 +59,6 @@ DEVICE REAL down(const REAL* M, const REAL* v, int from, int to) {
   return sum;
 }
 
-// L^{-1}, for a symmetric tile L L'; not finite if the tile is not positive definite.
-DEVICE void invert_root(Tile& t) {
-  UNROLL
-  for (int k = 0; k < TILE; ++k) {
-    const REAL root = inverse_root(t[k][k]);
-    REAL l[TILE];
-    UNROLL
-    for (int i = k + 1; i < TILE; ++i) l[i] = t[i][k] * root;
-    UNROLL
-    for (int j = 0; j < k; ++j) t[k][j] *= root;
-    t[k][k] = root;
-    UNROLL
-    for (int i = k + 1; i < TILE; ++i) {
-      UNROLL
-      for (int j = 0; j < k; ++j) t[i][j] -= l[i] * t[k][j];
-      t[i][k] = -l[i] * root;
-      UNROLL
-      for (int j = k + 1; j <= i; ++j) t[i][j] -= l[i] * l[j];
-    }
-  }
-  EACH_ENTRY if (b > a) t[a][b] = 0;
-}
-
-// Gauss elimination of the first PIVOTS blocks of rows of [S11 S21'; S21 S22], of which e are tiles
-// of the lower triangle, in place: it leaves L^{-1}, where S11 = L L', and below it -S21 S11^{-1}
-// and S22 - S21 S11^{-1} S21'. Step k takes the rows of block k, times the L^{-1} of its tile, from
-// all rows below; what the identity beside S11 turns into takes the places of zeros. Threads share
-// the block's rows, as they are before; those beyond the diagonal are columns below it.
-template <int PIVOTS, int COUNT>
-DEVICE void eliminate(Tile (&e)[EACH], const Places& places, REAL* panels, int thread) {
-  ROLLED
-  for (int k = 0; k < PIVOTS; ++k) {
-    REAL* panel = panels + k % 2 * TILE * PANEL;
-    EACH_TILE(COUNT) {
-      const int row = places.row[q], column = places.column[q];
-      if (row == k) EACH_ENTRY panel[a * PANEL + column * TILE + b] = e[q][a][b];
-      if (row > k && column == k) EACH_ENTRY panel[b * PANEL + row * TILE + a] = e[q][a][b];
-    }
-    sync();
-    Tile d;
-    UNROLL
-    for (int a = 0; a < TILE; ++a) {
-      const Line of_d = line(panel + a * PANEL + k * TILE);
-      UNROLL
-      for (int b = 0; b < TILE; ++b) d[a][b] = of_d.at[b];
-    }
-    invert_root(d);
-    EACH_TILE(COUNT) {
-      const int row = places.row[q], column = places.column[q];
-      if (row < k) continue;
-      Tile above = {};  // L^{-1} times the block's rows: of the identity in column k
-      if (column == k) {
-        EACH_ENTRY above[a][b] = d[a][b];
-      } else {
-        UNROLL
-        for (int c = 0; c < TILE; ++c) {
-          const Line y = line(panel + c * PANEL + column * TILE);
-          UNROLL
-          for (int a = c; a < TILE; ++a)
-            UNROLL
-            for (int b = 0; b < TILE; ++b) above[a][b] += d[a][c] * y.at[b];
-        }
-      }
-      if (row == k) {
-        EACH_ENTRY e[q][a][b] = above[a][b];
-        continue;
-      }
-      Tile factor = {};  // (L^{-1} times the block's rows in the columns of this row)'
-      UNROLL
-      for (int c = 0; c < TILE; ++c) {
-        const Line x = line(panel + c * PANEL + row * TILE);
-        UNROLL
-        for (int a = 0; a < TILE; ++a)
-          UNROLL
-          for (int b = c; b < TILE; ++b) factor[a][b] += x.at[a] * d[b][c];
-      }
-      EACH_ENTRY {
-        REAL sum = column == k ? REAL(0) : e[q][a][b];
-        UNROLL
-        for (int c = 0; c < TILE; ++c) sum -= factor[a][c] * above[c][b];
-        e[q][a][b] = sum;
-      }
-    }
-  }
-}
-
-template <int COLUMNS>
-DEVICE constexpr int bytes() {  // of one copy: rows begin at multiples of them
-  return COLUMNS % 4 == 0 && TILE == 4 && sizeof(REAL) == 4 ? 16
-         : COLUMNS % 2 == 0 && TILE % 2 == 0 ? (sizeof(REAL) == 4 ? 8 : 16) : sizeof(REAL);
-}
-
-template <int ROWS, int COLUMNS, int STRIDE>
-DEVICE void copy_matrix(REAL* to, const REAL* from, int thread) {
-  constexpr int BYTES = bytes<COLUMNS>(), EACH_COPY = BYTES / sizeof(REAL);
-  constexpr int IN_ROW = COLUMNS / EACH_COPY;
-  ROLLED
-  for (int c = thread; c < ROWS * IN_ROW; c += THREADS)
-    copy<BYTES>(to + c / IN_ROW * STRIDE + c % IN_ROW * EACH_COPY, from + c * EACH_COPY);
-}
-
-template <int COUNT, int STRIDE = 1>
-DEVICE void copy_vector(REAL* to, const REAL* from, int thread) {
-  ROLLED
-  for (int i = thread; i < COUNT; i += THREADS) copy<sizeof(REAL)>(to + i * STRIDE, from + i);
-}
-
 struct Stage {
   const REAL *A, *B, *h, *gx, *gu, *Hxx, *Hux, *Huu, *multipliers, *xi_u;
 };
@@ -252,8 +76,8 @@ DEVICE void load_cost(Tile& e, const Stage& at, int row, int column) {
   if (i_in_u && row == column) EACH_ENTRY if (a == b && a >= rows) e[a][b] = 1;
 }
 
-DEVICE void backward(const Stage& at, const Places& of_s, const Places& of_q, REAL* memory,
-                     REAL* left, REAL* gains, REAL s, int parity, int thread) {
+DEVICE void backward(const Stage& at, const Places<EACH>& of_s, const Places<EACH>& of_q,
+                     REAL* memory, REAL* left, REAL* gains, REAL s, int parity, int thread) {
   const int other = THREADS - 1 - thread;  // vectors, where tiles leave the last threads idle
   REAL *vectors = memory + parity * VECTORS, *panels = memory + M_PANEL;
   REAL *p = memory + M_p, *relaxed = SOFT ? memory + M_RELAXED : p;
@@ -284,7 +108,7 @@ DEVICE void backward(const Stage& at, const Places& of_s, const Places& of_q, RE
       EACH_ENTRY e[q][a][b] = scale * P[(i + a) * PX + j + b];
       if (row == of_s.column[q]) EACH_ENTRY if (a == b) e[q][a][b] += 1;
     }
-    eliminate<BX, OF_S>(e, of_s, panels, thread);
+    eliminate<BX, OF_S, PANEL>(e, of_s, panels, thread);
     EACH_TILE(OF_S) {
       const int row = of_s.row[q], column = of_s.column[q], j = column * TILE, i = row * TILE;
       if (row < BX) {
@@ -322,7 +146,7 @@ DEVICE void backward(const Stage& at, const Places& of_s, const Places& of_q, RE
   sync();
   EACH_TILE(OF_Q)
     add_product<SZ, SZ>(e[q], W + of_q.row[q] * TILE, G + of_q.column[q] * TILE, PX);
-  eliminate<BU, OF_Q>(e, of_q, panels, thread);
+  eliminate<BU, OF_Q, PANEL>(e, of_q, panels, thread);
   EACH_TILE(OF_Q) {
     const int row = of_q.row[q], column = of_q.column[q];
     const int j = column * TILE, ix = row * TILE - PU, jx = j - PU;
@@ -419,7 +243,7 @@ extern "C" KERNEL void newton(
   for (int i = thread; i < NX * NX; i += THREADS) matrices[i / NX * PX + i % NX] = end[i];
   for (int i = thread; i < NX; i += THREADS) p[i] = gx[(first_cost + horizon) * NX + i];
   sync();
-  const Places of_s(BX, thread), of_q(BZ + 1, thread);
+  const Places<EACH> of_s(BX, thread), of_q(BZ + 1, thread);
   ROLLED
   for (int k = horizon - 1; k >= 0; --k) {
     const long at = first + k, cost = first_cost + k;

@@ -1,12 +1,15 @@
 """Accelerations under constraints: the plain solver, and its GPU kernel, interpreted."""
 
+import shutil
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cuda_on_cpu import caller
 
+from mjx_drax.kernels import constraint_solver, constraints_cuda
 from mjx_drax.kernels import elliptic_cones as elliptic
 from mjx_drax.kernels.constraint_solver import (
     Constraints,
@@ -159,6 +162,41 @@ def test_the_kernel_finds_the_same_accelerations(make):
     wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)
     found = minima(given, interpret=True)
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.skipif(not shutil.which("g++"), reason="it needs a C++ compiler")
+@pytest.mark.parametrize(
+    ("nv", "m", "dtype"),
+    [
+        (5, 7, np.float64),  # one warp, small tiles
+        (18, 140, np.float64),  # several warps, large tiles
+        (5, 7, np.float32),
+    ],
+)
+def test_the_kernel_of_cuda_finds_the_same_accelerations(nv, m, dtype, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(constraints_cuda.cuda, "call", caller(tmp_path, calls))
+    with jax.enable_x64(dtype == np.float64):
+        given = jax.tree.map(lambda a: jnp.asarray(a, dtype), drawn(3, nv, m))
+        wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)
+        found = constraints_cuda.minima(given[:-1])
+    close = 1e-9 if dtype == np.float64 else 1e-4
+    np.testing.assert_allclose(found, wanted, rtol=close, atol=close)
+    assert [sizes["THREADS"] for sizes in calls] == [32 if m < 100 else 96]
+
+
+def test_which_kernel_a_gpu_takes(monkeypatch):
+    monkeypatch.setattr(constraint_solver, "on_gpu", lambda: True)
+    limits, contacts = drawn(), drawn_with_cones()
+    in_float64 = jax.tree.map(lambda a: np.asarray(a, float), limits)
+
+    def taken(given):
+        kernel = constraint_solver._kernel_for(given)
+        return "cuda" if kernel not in (None, minima) else kernel
+
+    for memory, of_each in ((227 * 1024, ["cuda", minima, "cuda"]), (0, [minima, minima, None])):
+        monkeypatch.setattr(constraints_cuda.cuda, "shared_memory", lambda memory=memory: memory)
+        assert [taken(given) for given in (limits, contacts, in_float64)] == of_each
 
 
 def test_changes_are_those_of_a_function_whose_slope_is_the_law():

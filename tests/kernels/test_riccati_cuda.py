@@ -1,13 +1,11 @@
 """The CUDA kernel of the Riccati recursion, on a CPU, against the plain recursion of the method."""
 
-import ctypes
 import shutil
-import subprocess
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from cuda_on_cpu import caller
 from riccati_problems import agree, batch
 
 from mjx_drax.kernels import riccati_cuda
@@ -16,47 +14,19 @@ from mjx_drax.method.riccati import newton
 
 pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="it needs a C++ compiler")
 
-PROGRAM = """
-#include "cuda_on_cpu.h"
-#include "riccati.cu"
-extern "C" int shared() { return SHARED; }
-extern "C" int left() { return LEFT; }
-extern "C" void run(int rows, int horizon, REAL** p) {
-  const int chains = BLOCK_SIZE / THREADS;
-  launch((rows + chains - 1) / chains, BLOCK_SIZE, chains * SHARED, [=] {
-    newton(POINTERS, rows, horizon);
-  });
-}
-"""
-
 
 @pytest.fixture
 def on_cpu(tmp_path, monkeypatch):
-    """Kernels that are called from now on are compiled for this CPU; how often, in a list."""
+    """Kernels that are called from now on are compiled for this CPU; their sizes, in a list."""
     calls = []
+    call = caller(tmp_path, calls)
 
-    def call(source, kernel, sizes, blocks, warps, shared, arrays, shapes, numbers):
-        results = [np.full(shape, np.nan, arrays[0].dtype) for shape in shapes]
-        given = [*(np.ascontiguousarray(a) for a in arrays), *results]
-        pointers = ", ".join(f"p[{i}]" for i in range(len(given)))
-        program = tmp_path / f"{len(calls)}.cpp"
-        program.write_text(PROGRAM.replace("POINTERS", pointers))
-        # -Bsymbolic: its sync() is not that of the C library
-        compiler = ["g++", "-std=c++20", "-shared", "-fPIC", "-pthread", "-Wl,-Bsymbolic"]
-        folders = [f"-I{Path(__file__).parent}", f"-I{source.parent}"]
-        macros = [f"-D{name}={value}" for name, value in sizes.items()]
-        library = program.with_suffix(".so")
-        subprocess.run([*compiler, *folders, *macros, "-o", library, program], check=True)
-        compiled = ctypes.CDLL(str(library))
-        chains = warps * 32 // sizes["THREADS"]
-        assert shared == chains * compiled.shared() * arrays[0].dtype.itemsize
-        assert shapes[-1][-1] == compiled.left()
-        assert blocks * chains >= arrays[0].shape[0]
-        compiled.run(*numbers, (ctypes.c_void_p * len(given))(*(a.ctypes.data for a in given)))
-        calls.append(sizes)
-        return results
+    def checked(source, kernel, sizes, blocks, warps, shared, arrays, shapes, numbers):
+        chains = max(32 // sizes["THREADS"], 1)
+        assert blocks * chains >= arrays[0].shape[0] > (blocks - 1) * chains
+        return call(source, kernel, sizes, blocks, warps, shared, arrays, shapes, numbers)
 
-    monkeypatch.setattr(riccati_cuda.cuda, "call", call)
+    monkeypatch.setattr(riccati_cuda.cuda, "call", checked)
     return calls
 
 

@@ -25,6 +25,15 @@ inline REAL shuffled(REAL a, int by) {
   sync();
   return other;
 }
+inline unsigned int ballot(bool a) {
+  (*lanes)[THREAD] = a;
+  sync();
+  unsigned int bits = 0;
+  for (int i = 0; i < 32; ++i) bits |= (*lanes)[THREAD / 32 * 32 + i] != 0 ? 1u << i : 0;
+  sync();
+  return bits;
+}
+inline int ones(unsigned int bits) { return __builtin_popcount(bits); }
 template <int BYTES>
 void copy(REAL* to, const REAL* from) {
   for (size_t i = 0; i < BYTES / sizeof(REAL); ++i) to[i] = from[i];
