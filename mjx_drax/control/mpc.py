@@ -284,11 +284,11 @@ class MPC:
         What is not finite is not used: the plan stays, and `statistics.failed` counts it.
 
         Raises:
-            DraxError: there is no plan yet, x is no vector (nx,), or t is not finite.
+            DraxError: there is no plan yet, x is no vector (nx,), or t is not finite, or a step
+                before the time of the plan in use.
         """
-        self.latest  # noqa: B018 complains if there is none
         x = self._state(x)
-        _require_time(t)
+        self._require_not_before(t)
         by = max(0.0, (t - self._time) / float(self.problem.dynamics.dt))
         clock = time.perf_counter()
         with self.problem.arithmetic():
@@ -341,9 +341,18 @@ class MPC:
 
     def due(self, t: float) -> bool:
         """Whether `every` steps of the plan in use have passed since it was made."""
-        _require_time(t)
+        self._require_not_before(t)
         steps = (t - self.latest.time) / self._step
         return steps > self.every - 1e-6
+
+    def _require_not_before(self, t: float) -> None:
+        """Complain where a time is a step before the plan in use: no plan would ever be due."""
+        _require_time(t)
+        if t < self.latest.time - self._step:
+            raise DraxError(
+                f"the time t is {t:g} s, and the plan in use is of {self.latest.time:g} s: to "
+                "begin anew call policy.reset(x, t), or policy.rewind(t)."
+            )
 
     def _taken(self) -> Carried:
         """The chains, which a plan overwrites: they are gone if it does not come to its end."""

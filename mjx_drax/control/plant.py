@@ -145,9 +145,10 @@ def _require_push(push: object) -> None:
         raise DraxError(f"a push is {shown(push)}: give a Push(time, body, force).")
     if _finite(push.force, 3) is None:
         raise DraxError(f"the force of a push is {shown(push.force)}: give 3 finite numbers [N].")
-    if not is_number(push.time) or not is_number(push.lasts) or push.lasts < 0:
+    if not all(is_number(seconds) and seconds >= 0 for seconds in (push.time, push.lasts)):
         raise DraxError(
-            f"a push begins at {shown(push.time)} and lasts {shown(push.lasts)}: give seconds."
+            f"a push begins at {shown(push.time)} and lasts {shown(push.lasts)}: give seconds, 0 "
+            "or more."
         )
 
 

@@ -31,6 +31,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_drax.base.errors import (
     DraxError,
@@ -317,6 +318,13 @@ def _polished(
     if tolerance is not None:
         example = "1e-6; tolerances, plural, is for violations of replays"
         require_positive("tolerance", tolerance, f"a number, such as {example}")
+        numbers = np.finfo(problem.x_init.dtype)
+        if tolerance < numbers.eps:
+            fix = "precision=64, or " if numbers.bits == 32 else ""
+            raise DraxError(
+                f"tolerance is {tolerance:g}, less than what float{numbers.bits} can tell apart, "
+                f"{numbers.eps:.2g}: give {fix}a larger one."
+            )
         given["tolerance"] = float(tolerance)
     if iterations is not None:
         require_whole("max_iterations", iterations)

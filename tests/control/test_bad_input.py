@@ -69,6 +69,8 @@ LOOPS = [
     ("push-nan", lambda at: Plant(at.robot, pushes=[Push(0.0, "link", (NAN, 0, 0))]),
      "force", "nan"),
     ("push-time", lambda at: Plant(at.robot, pushes=[Push("soon", "link", (1, 0, 0))]), "'soon'"),
+    ("push-before", lambda at: Plant(at.robot, pushes=[Push(-1.0, "link", (1, 0, 0))]),
+     "a push begins at -1.0"),
     ("push-tuple", lambda at: Plant(at.robot, pushes=[(0.0, "link")]), "a push is (0.0, 'link')"),
     ("pushes", lambda at: Plant(at.robot, pushes=3), "pushes are 3", "list"),
     ("plant-none", lambda at: Plant(None), "the problem is None"),

@@ -168,6 +168,16 @@ def test_going_back_keeps_the_precision_and_gives_the_same_plans():
     assert not np.array_equal(*first)
 
 
+def test_a_time_before_the_plan_in_use_says_how_to_begin_anew(policy):
+    policy([0.5, 0.0], 20 * DT)
+    for call in (policy, policy.plan):
+        with pytest.raises(DraxError, match=r"plan in use is of 2 s: to begin anew call policy"):
+            call([0.5, 0.0], 0.0)
+    policy.rewind()
+    policy([0.5, 0.0], DT)
+    assert policy.latest.time == DT
+
+
 def test_a_plan_that_was_interrupted_says_how_to_go_on(policy, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt

@@ -43,6 +43,8 @@ SETTINGS = [
     ("solver-dict", lambda at: solve(at.point, solver={"attempts": 3}), "solver is {'attempts'"),
     ("tolerance-text", lambda at: solve(at.point, tolerance="1e-6"), "tolerance is '1e-6'"),
     ("tolerance-0", lambda at: solve(at.point, tolerance=0), "tolerance is 0", "1e-6"),
+    ("tolerance-float32", lambda at: solve(at.point, tolerance=1e-9),
+     "tolerance is 1e-09, less than what float32 can tell apart", "precision=64"),
     ("tolerance-nan", lambda at: minimize(at.program, tolerance=NAN), "tolerance is nan"),
     ("tolerance-violations", lambda at: solve(at.point, tolerance=Tolerances()),
      "tolerance is Tolerances", "tolerances, plural"),
