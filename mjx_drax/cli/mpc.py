@@ -1,8 +1,9 @@
 """Model predictive control: plan again and again while MuJoCo's C engine runs.
 
-A task's model is driven several times, with random pushes. Plans per second, latency, cost and the
-share of runs that end in the goal are printed; mpc.json is written. The exit status is 0 if all
-runs end in the goal.
+A model, a task's or your own, is driven several times, with random pushes. Plans per second,
+latency, cost and the share of runs that end in the goal are printed; mpc.json is written. The exit
+status is 0 if all runs end in the goal.
+
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from mjx_drax import tasks
 from mjx_drax.base.errors import require_not_negative
 from mjx_drax.base.files import write_json
-from mjx_drax.cli import pictures
-from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
+from mjx_drax.cli import cost_file, pictures
+from mjx_drax.cli.common import at_least_1, say, say_nothing
+from mjx_drax.cli.problem import add_problem, asked, require_known
+
+__doc__ += cost_file.HELP
 
 NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "chains": (at_least_1, 8, "number of chains; default 8"),
@@ -27,7 +30,7 @@ NUMBERS: dict[str, tuple[Any, Any, str]] = {
     "iterations": (at_least_1, 2, "iterations of every chain for a plan; default 2"),
     "every": (at_least_1, 1, "control steps between two plans; default 1"),
     "hold": (float, 0.1, "weight of the terminal cost along the horizon [1/s]; default 0.1"),
-    "horizon": (float, None, "duration of a plan [s]; default the task's"),
+    "horizon": (float, None, "duration of a plan [s]; default the problem's"),
     "duration": (float, None, "duration of a run [s]; default the horizon and 8 more"),
     "runs": (at_least_1, 10, "number of runs; default 10"),
     "pushes": (int, 2, "number of pushes in every run; default 2"),
@@ -45,8 +48,8 @@ NUMBERS: dict[str, tuple[Any, Any, str]] = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The task, numbers, and what to write."""
-    parser.add_argument("task", help=TASK)
+    """The problem, numbers, and what to write."""
+    add_problem(parser)
     for name, (kind, default, words) in NUMBERS.items():
         parser.add_argument(f"--{name}", type=kind, default=default, metavar="N", help=words)
     parser.add_argument(
@@ -63,16 +66,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Drive the model, and report; what cannot work is refused before anything compiles."""
-    tasks.full_name(options.task)  # answers at once, before heavy imports
+    require_known(options)
     from mjx_drax.control import trials as runs
     from mjx_drax.control.mpc import MPC
     from mjx_drax.control.plant import Plant
     from mjx_drax.solution.files.save import writable
     from mjx_drax.view.video import check as require_drawing
 
-    problem = make(tasks.load(options.task), options.horizon)
+    given = asked(options)
+    problem = given.problem
     names = ("chains", "explorers", "iterations", "every", "hold", "seed")
-    policy = MPC(problem, **{name: getattr(options, name) for name in names})
+    numbers = {name: getattr(options, name) for name in names}
+    policy = MPC(problem, solver=given.solver, **numbers)
     usual = float(problem.times[-1]) + 8.0
     duration = usual if options.duration is None else options.duration
     require_not_negative("push", options.push)
@@ -94,14 +99,14 @@ def run(options: argparse.Namespace) -> int:
         tell(f"run {number}: {verdict[motion.reached]} after {len(motion.pushes)} pushes")
 
     trials.run(options.runs, options.pushes, options.push, options.seed, report, **errors)
-    numbers = {**trials.summary(), "push": options.push, "hold": options.hold, **errors}
-    written = [write_json(folder / "mpc.json", numbers).name]
+    summary = {**trials.summary(), "push": options.push, "hold": options.hold, **errors}
+    written = [write_json(folder / "mpc.json", summary).name]
     if options.video:
         film = runs.film(problem, trials.motions[0], folder / "mpc.mp4", **look)
         written.append(film.name)
-    for line in runs.lines(numbers):
+    for line in runs.lines(summary):
         tell(line)
     tell(f"written to {folder}/: {', '.join(written)}")
     if options.json:
         print((folder / "mpc.json").read_text(encoding="utf-8"), end="", flush=True)
-    return 0 if numbers["success_rate"] in (None, 1.0) else 1
+    return 0 if summary["success_rate"] in (None, 1.0) else 1

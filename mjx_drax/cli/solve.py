@@ -11,16 +11,14 @@ import argparse
 from contextlib import ExitStack, suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import cost_file, export, pictures
-from mjx_drax.cli.common import TASK, at_least_1, make, say, say_nothing
+from mjx_drax.cli.common import at_least_1, say, say_nothing
+from mjx_drax.cli.problem import Asked, add_problem, asked, require_known
 
 if TYPE_CHECKING:
-    from mjx_drax.problem.problem import Problem
-    from mjx_drax.search.restarts import Restarts
     from mjx_drax.solution.violations import Tolerances
 
 __doc__ += cost_file.HELP
@@ -29,9 +27,7 @@ __doc__ += cost_file.HELP
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to solve, how, and what to write."""
     add = parser.add_argument
-    add("task", nargs="?", help=TASK)
-    add("--model", metavar="XML", help="MJCF file of your own, with --cost")
-    add("--cost", metavar="PY", help="Python file with the cost (see above)")
+    add_problem(parser)
     add(
         "--chains",
         type=at_least_1,
@@ -135,8 +131,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Solve, save and draw; what cannot work is refused before anything compiles."""
-    if options.task is not None:
-        tasks.full_name(options.task)  # answers at once, before heavy imports
+    require_known(options)
     import jax
 
     with ExitStack() as stack:
@@ -250,33 +245,12 @@ def _tolerances(texts: list[str]) -> Tolerances:
     return Tolerances(**given)  # type: ignore[arg-type]
 
 
-class Asked(NamedTuple):
-    """What to solve, and how; `draw` draws what has no model."""
-
-    problem: Problem
-    solver: Restarts
-    chains: int
-    draw: Any
-
-
 def _asked(options: argparse.Namespace) -> Asked:
-    """The named task, or the user's own problem, with the settings that the options change."""
+    """What is asked for, with the settings that the options change."""
     from mjx_drax.search import settings
-    from mjx_drax.search.restarts import Restarts
 
-    if options.task is not None:
-        if options.model or options.cost:
-            raise DraxError(
-                f"both the task {options.task!r} and --model or --cost are given: choose one."
-            )
-        task = tasks.load(options.task)
-        problem, solver = make(task, options.horizon), Restarts()
-        chains, draw = getattr(task, "CHAINS", 64), getattr(task, "draw", None)
-    elif options.model and options.cost:
-        problem, solver = cost_file.load(options.model, options.cost, options.horizon)
-        chains, draw = 64, None
-    else:
-        raise DraxError("give a task (see `mjx-drax list`), or both --model XML and --cost PY.")
+    given = asked(options)
+    solver = given.solver
     if options.iterations is not None:
         solver = solver.with_iterations(options.iterations)
     for text in options.settings:
@@ -284,4 +258,4 @@ def _asked(options: argparse.Namespace) -> Asked:
         if not (name and equals and value):
             raise DraxError(f"--set {text!r}: give NAME=VALUE, such as attempts=3.")
         solver = settings.changed(solver, name, value)
-    return Asked(problem, solver, options.chains or chains, draw)
+    return given._replace(solver=solver, chains=options.chains or given.chains)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import textwrap
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -458,6 +459,25 @@ def test_a_cartpole_swings_up_and_bears_pushes(mode, tmp_path, capsys):
     if not mode:  # in real time it depends on the computer
         assert status == 0
         assert numbers["success_rate"] == 1.0
+
+
+def test_the_command_drives_a_model_by_a_cost_file(tmp_path, capsys):
+    (tmp_path / "slider.xml").write_text(SLIDER)
+    cost = """
+    horizon, dt, x_init = 0.6, 0.02, [0.1, 0.0]
+    def running_cost(data, u): return 1e-2 * u[0] ** 2
+    def terminal_residual(data): return 10.0 * jnp.append(data.qpos, data.qvel)
+    def goal(data): return abs(data.qpos[0]) < 0.02
+    """
+    (tmp_path / "cost.py").write_text("import jax.numpy as jnp\n" + textwrap.dedent(cost))
+    mine = ["--model", str(tmp_path / "slider.xml"), "--cost", str(tmp_path / "cost.py")]
+    few = ["--chains", "2", "--runs", "1", "--pushes", "0", "--duration", "3"]
+    assert main(["mpc", *mine, *few, "--out", str(tmp_path)]) == 0
+    assert "slider: K = 30 knots, 2 chains" in capsys.readouterr().out
+    assert json.loads((tmp_path / "mpc.json").read_text())["success_rate"] == 1.0
+    assert main(["mpc", "cartpole", *mine]) == 2
+    assert "both the task 'cartpole' and --model or --cost" in capsys.readouterr().err
+    assert main(["mpc"]) == 2
 
 
 def test_the_command_refuses_before_it_compiles(capsys):
