@@ -24,9 +24,10 @@ from mjx_drax.method.bounds import Projection
 from mjx_drax.method.descent import Info, diagnosed
 from mjx_drax.method.gauss_newton import GaussNewton
 from mjx_drax.method.langevin import Langevin, State, keep_finite
-from mjx_drax.method.model import expand
+from mjx_drax.method.model import Multipliers, expand
 from mjx_drax.polish import interior_point
 from mjx_drax.polish.interior_point import Polish
+from mjx_drax.polish.residual import residual_of
 from mjx_drax.problem.problem import PARTS, Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.identity import identity
@@ -332,6 +333,25 @@ def feedback_gains(own: Question, shared: Question, states: State) -> Array:
         return metric.direction(q.problem, model, None, ()).gains
 
     found: Array = by_row(shared, own, gains, states)
+    return found
+
+
+@partial(compiled, key=identity_of_rows)
+@full_precision
+def residuals(
+    own: Question, shared: Question, knots: Trajectory, multipliers: Multipliers
+) -> Array:
+    """The residual (rows,) of knots with multipliers, those of bounds included."""
+
+    def of_row(q: Question, knots: Trajectory, multipliers: Multipliers) -> Array:
+        flow, problem = q.flow, q.problem.prepared()
+        present = replace(multipliers, bounds=None), flow.weights(2.0)
+        by, key = flow.preconditioner.derivatives, jax.random.key(0)
+        model = expand(problem, flow.bounds, knots, *present, by, key)
+        assert multipliers.bounds is not None  # for the type checker
+        return residual_of(problem, model, multipliers.bounds)[0].total
+
+    found: Array = by_row(shared, own, of_row, knots, multipliers)
     return found
 
 

@@ -6,15 +6,20 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, require_whole, shown
+from mjx_drax.method.descent import Info
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
+from mjx_drax.search.iterate import Question, evaluate, partition, residuals
+from mjx_drax.search.units import to_units
 from mjx_drax.solution import report, worst
 from mjx_drax.solution.files.load import load
 from mjx_drax.solution.files.save import save
-from mjx_drax.solution.replay import both_ways
+from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import Results
 from mjx_drax.solution.violations import Tolerances, as_tolerances
 
@@ -79,7 +84,10 @@ class Solution(Results):
         return worst.table(self, chain, count)
 
     def certify(self, tolerances: Tolerances | None = None) -> Solution:
-        """The same solution with every chain replayed again, by the engine that is here now.
+        """The same solution judged again: by its problem's functions, and by the engine here now.
+
+        Every chain is replayed, and what is known of its plan is computed anew. A residual that
+        was larger when it was solved stays.
 
         Args:
             tolerances: of violations of the replays; by default those that it was solved with.
@@ -90,16 +98,34 @@ class Solution(Results):
         """
         problem, u = self.problem, np.asarray(self.trajectories.u)
         chosen = self.tolerances if tolerances is None else as_tolerances(tolerances)
-        plan = self.plans.astype(float)
-        open_loop, feedback, gains = both_ways(Family.of_one(problem), plan, u, self.gains, chosen)
+        family, plan = Family.of_one(problem), self.plans.astype(float)
+        open_loop, feedback, gains = both_ways(family, plan, u, self.gains, chosen)
+        with problem.arithmetic():
+            info, residual = self._judged()
         return replace(
             self,
+            cost=np.asarray(info.cost),
+            max_defect=np.asarray(info.max_defect),
+            max_violation=np.asarray(info.max_violation),
+            residual=residual,
+            plan=plan_violations(family, plan, u),
             open_loop=open_loop,
             feedback=feedback,
             gains=gains,
             tolerances=chosen,
             engine=problem.dynamics.engine,
         )
+
+    def _judged(self) -> tuple[Info, np.ndarray]:
+        """Where the plans are by the problem's functions, and their residuals (chains,)."""
+        problem, known = self.problem, (self.trajectories, self.multipliers)
+        knots, multipliers = to_units(problem, *jax.tree.map(jnp.asarray, known))
+        info = evaluate(problem, knots)
+        if multipliers.bounds is None:  # nothing was polished
+            return info, self.residual
+        shared, own = partition(Question(self.solver.flow, problem), None)
+        found = np.asarray(residuals(own, shared, knots, multipliers))
+        return info, np.maximum(self.residual, found)
 
 
 def require_solution(solution: object) -> None:

@@ -158,7 +158,7 @@ def test_a_batch_is_shown_by_its_counts_and_by_what_failed():
 def test_the_advice_where_all_chains_miss_the_goal_at_the_same_cost():
     problem = point(goal=lambda x: False)
     made = made_up(problem, 4)
-    same = replace(made, cost=np.array([2.0, 2.001, 2.0, 5.0], np.float32)).certify()
+    same = replace(made.certify(), cost=np.array([2.0, 2.001, 2.0, 5.0], np.float32))
     assert "miss the goal, 3 of 4 at the same cost" in str(same).splitlines()[-1]
     others = replace(same, cost=np.array([2.0, 3.0, 4.0, 5.0], np.float32))
     assert "miss the goal or break constraints" in str(others).splitlines()[-1]
@@ -167,14 +167,16 @@ def test_the_advice_where_all_chains_miss_the_goal_at_the_same_cost():
 def test_the_advice_where_there_is_no_goal_and_replays_leave_the_plan():
     made = made_up(point(goal=None))
     off = replace(made.trajectories, x=made.trajectories.x + 0.5)
-    told = str(replace(made, trajectories=off).certify()).splitlines()[-1]
+    judged = replace(made, trajectories=off).certify()
+    told = str(replace(judged, max_defect=made.max_defect)).splitlines()[-1]
     assert "replays leave the plan" in told
     assert "tolerances.tracking" in told
     assert "goal or break" not in told
 
 
 def test_the_advice_where_the_plan_lacks_a_contact(monkeypatch):
-    solution = made_up(robot(goal=lambda data: False)).certify()
+    made = made_up(robot(goal=lambda data: False))
+    solution = replace(made.certify(), max_defect=made.max_defect)
     told = (2, "'floor' touches 'shin'")
     monkeypatch.setattr(type(solution.problem.dynamics), "left_out", lambda self, states: told)
     assert "at knot 2, 0.04 s, 'floor' touches 'shin', and the plan" in str(solution)

@@ -6,9 +6,11 @@ from dataclasses import fields, replace
 from hashlib import sha256
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from builders import point as to_a_point
 
 from mjx_drax import (
     DraxError,
@@ -98,6 +100,30 @@ def test_functions_are_missing_until_the_problem_is_given(slider, folder):
             needs()
     certified = Solution.load(folder, slider.problem).certify()
     assert certified.certificate == slider.certificate
+
+
+def test_another_problem_judges_plans_and_their_optimality_anew(tmp_path):
+    """Another cost, a cost with the same value at the plan, and the same problem."""
+
+    def reaching(target, weight):
+        return to_a_point(
+            terminal_residual=lambda x: 10.0 * (x - target),
+            running_cost=lambda x, u: 1e-2 * u @ u + weight * (u[0] - u[1]),
+        )
+
+    solved = solve(reaching(jnp.array([1.0, 1.0]), 0.0), chains=2)
+    assert solved.optimal
+    solved.save(tmp_path)
+    for problem, as_before, optimal in (
+        (reaching(jnp.array([1.0, 1.0]), 0.0), True, True),
+        (reaching(jnp.array([3.0, 3.0]), 0.0), False, False),
+        (reaching(jnp.array([1.0, 1.0]), 1.0), True, False),
+    ):
+        again = Solution.load(tmp_path, problem).certify()
+        assert again.optimal == optimal
+        assert np.allclose(again.cost, solved.cost, rtol=1e-3, atol=1e-5) == as_before
+        assert np.allclose(again.cost, again.replay_cost, rtol=1e-3, atol=1e-5)
+        assert (again.residual >= solved.residual).all()
 
 
 def test_another_problem_is_refused(slider, folder):
