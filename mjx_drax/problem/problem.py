@@ -581,9 +581,10 @@ def checked(problem: Problem) -> Problem:
     if start.dtype.kind != "f" or not np.isfinite(start).all():
         raise DraxError(f"x_init is {shown(start)}: give a vector of finite floats.")
     if start.shape != (nx,):
-        raise DraxError(
-            f"x_init has shape {start.shape}: give {nx} numbers, the states of the dynamics."
-        )
+        fix = f"give {nx} numbers, the states of the dynamics."
+        if start.shape == (dynamics.given_nx,):
+            fix = "call with_x_init, which keeps the other states, those of what is left open."
+        raise DraxError(f"x_init has shape {start.shape}: {fix}")
     _check_bounds(problem, start)
     for path, rows in jax.tree_util.tree_leaves_with_path(problem.data):
         require_length("data" + jax.tree_util.keystr(path), rows, problem.horizon + 1)

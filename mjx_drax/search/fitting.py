@@ -1,9 +1,11 @@
-"""Boxes of initial knots for motions that use next to nothing of the room between their bounds.
+"""Boxes of initial knots that fit the motions that are found: narrower ones, or wider ones.
 
 By default initial knots are drawn between the bounds, and a coordinate that hardly moves counts as
 a hundredth of that box: in the residual, and in what constraints are allowed. Bounds of 1e6, which
 are to say that there are none, would so make anything feasible and optimal. No bound is too wide by
-itself, as units are the user's; a motion that is found tells.
+itself, as units are the user's; a motion that is found tells. Where there are no bounds, it also
+tells that the default box is too small: defects are measured by that, and what is a thousand times
+as far away would need more digits than numbers have.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ what stands still says nothing of how far it could have moved."""
 
 BOXES = 3
 """So many times at most."""
+
+NARROWER, WIDER = "narrower", "wider"
 
 Found = TypeVar("Found")
 
@@ -56,31 +60,38 @@ class Answer(Generic[Found]):
 def in_a_fitting_box(
     problem: Problem,
     solved: Callable[[Problem], Answer[Found]],
-    told: Callable[[Problem, np.ndarray], None],
+    told: Callable[[Problem, np.ndarray, str], None],
     tolerance: float,
 ) -> Found:
-    """What `solved` finds, again and again in a narrower box as long as that is better.
+    """What `solved` finds, again and again in a box that fits better as long as that helps.
 
     Args:
         problem: as given.
         solved: solves it, with this or another box.
-        told: called with the problem and the entries (nx + nu,) that got narrower sides, if any.
+        told: called with the problem, the entries (nx + nu,) that got other sides, if any, and
+            NARROWER or WIDER.
         tolerance: on the residual; what is cheaper by this share shows that what it replaces is
             no optimum.
     """
     given, answer = problem, solved(problem)
-    narrower = np.zeros(problem.dynamics.nx + problem.dynamics.nu, bool)
+    nothing = np.zeros(problem.dynamics.nx + problem.dynamics.nu, bool)
+    others = {NARROWER: nothing, WIDER: nothing}
     for _ in range(BOXES):
-        fitting = None if answer.last else narrowed(given, problem, answer.x, answer.knots.u)
+        if answer.last:
+            break
+        how, fitting = NARROWER, narrowed(given, problem, answer.x, answer.knots.u)
+        if fitting is None and not np.isfinite(answer.cost):
+            how, fitting = WIDER, widened(problem, answer.x, answer.knots.u)
         if fitting is None:
             break
         problem, which = fitting
         other = solved(problem)
         if not is_better(other.problem, answer.knots, answer.cost, other.cost, tolerance):
             break
-        answer, narrower = other, narrower | which
-    if narrower.any():
-        told(given, narrower)
+        answer, others[how] = other, others[how] | which
+    for how, which in others.items():
+        if which.any():
+            told(given, which, how)
     return answer.found
 
 
@@ -124,6 +135,34 @@ def narrowed(
         for end, side, new in zip(ends, box, (about - reach, about + reach), strict=True):
             sides[end] = jnp.asarray(np.where(wide, np.clip(new, *box), side), side.dtype)
         which.append(wide)
+    changed = np.concatenate(which)
+    if not changed.any():
+        return None
+    return replace(problem, scatter=replace(problem.scatter, **sides)), changed
+
+
+def widened(problem: Problem, x: np.ndarray, u: ArrayLike) -> tuple[Problem, np.ndarray] | None:
+    """The problem with a box of initial knots that holds a motion which broke what must hold.
+
+    None if that motion goes nowhere beyond AROUND times the box where no bound is. Knots of 1e6
+    that must not be off by a thousandth of a box of +-1 would need more digits than float32 has.
+
+    Args and what is returned are those of `narrowed`.
+    """
+    if problem.dynamics.kinked:
+        return None
+    controls = np.asarray(u)
+    sides: dict[str, Any] = {}
+    which = []
+    for name, moves, about in (("x", x, x[0]), ("u", controls, np.zeros(controls.shape[1]))):
+        ends, both = (f"{name}_lower", f"{name}_upper"), (problem.bounds, problem.scatter)
+        bounds, box = ([np.asarray(getattr(of, end)) for end in ends] for of in both)
+        extent = np.abs(moves - about).max(axis=0, initial=0.0)
+        far = np.isinf(bounds).all(axis=0) & np.isfinite(extent)
+        far &= extent > AROUND * (box[1] - box[0])
+        for end, side, new in zip(ends, box, (about - 2 * extent, about + 2 * extent), strict=True):
+            sides[end] = jnp.asarray(np.where(far, new, side), side.dtype)
+        which.append(far)
     changed = np.concatenate(which)
     if not changed.any():
         return None

@@ -24,9 +24,9 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for, sharing
 from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.fitting import narrowed
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.search.narrowing import narrowed
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import (
@@ -46,7 +46,7 @@ from mjx_drax.solution.violations import (
     Violation,
     as_tolerances,
     most_broken,
-    warn_of_wide_bounds,
+    warn_of_box,
 )
 
 SHARE = 0.5
@@ -221,7 +221,7 @@ def solve_batch(
 ) -> BatchSolution:
     """Solve the problems make(value), for thousands of values.
 
-        solve_batch(lambda x: dataclasses.replace(problem, x_init=x), states)
+        solve_batch(problem.with_x_init, states)
 
     Args:
         make: gives a problem for one value; it is traced, so it may change any number of a problem
@@ -303,7 +303,7 @@ def _certified(
     moves = (plan - plan[:, :1]).reshape(-1, plan.shape[2])  # the first is 0
     wide = narrowed(one, one, moves, u.reshape(-1, u.shape[2]))
     if wide is not None:
-        warn_of_wide_bounds(one, wide[1], again=False)
+        warn_of_box(one, wide[1])
     return BatchSolution(
         family=family,
         x=plan,

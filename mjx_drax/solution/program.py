@@ -29,9 +29,9 @@ from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Progress, Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.fitting import Answer, in_a_fitting_box
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import FEASIBLE
-from mjx_drax.search.narrowing import Answer, in_a_fitting_box
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.units import to_units
 from mjx_drax.solution.log import history_of, table
@@ -39,7 +39,7 @@ from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
 from mjx_drax.solution.report import INTERRUPTED, counts, html
 from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
-from mjx_drax.solution.violations import Violation, most_broken, warn_of_wide_bounds
+from mjx_drax.solution.violations import Violation, most_broken, warn_of_box
 
 
 def from_program(
@@ -221,7 +221,7 @@ def minimize(
 
     Warns:
         DraxWarning: bounds are far wider than the answer, so the program was solved again from
-            points nearer to it (`search.narrowing`).
+            points that fit it (`search.fitting`).
     """
     program = checked(program)
     if program.dynamics.nx or program.horizon != 1:
@@ -263,7 +263,7 @@ def minimize(
             knots = Trajectory(jnp.zeros((1, 0), u.dtype), u[best])
             return Answer(minimum, program, nothing, knots, cost, found.interrupted)
 
-        return in_a_fitting_box(program, solved, warn_of_wide_bounds, tolerance_of(settings))
+        return in_a_fitting_box(program, solved, warn_of_box, tolerance_of(settings))
 
 
 def _knots(guess: ArrayLike, chains: int, size: int) -> Trajectory:

@@ -19,9 +19,9 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Progress, Search
 from mjx_drax.search.family import Family
+from mjx_drax.search.fitting import Answer, in_a_fitting_box
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
-from mjx_drax.search.narrowing import Answer, in_a_fitting_box
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.units import to_units
@@ -34,8 +34,8 @@ from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import (
     Tolerances,
     as_tolerances,
+    warn_of_box,
     warn_of_loose_ends,
-    warn_of_wide_bounds,
 )
 
 
@@ -103,8 +103,9 @@ def solve(
             knot; a checkpoint that cannot be written, is damaged or belongs to another solve.
 
     Warns:
-        DraxWarning: bounds are far wider than the motion, so the problem was solved again from
-            knots nearer to it (`search.narrowing`); conditions of the end that say little.
+        DraxWarning: bounds are far wider than the motion, or it leaves the default box far behind,
+            so the problem was solved again from knots that fit it (`search.fitting`); conditions
+            of the end that say little.
     """
     problem = checked(problem)
     if problem.dynamics.nx == 0:
@@ -158,7 +159,7 @@ def solve(
                 solution.interrupted or spent[1] >= most or live,
             )
 
-        solution = in_a_fitting_box(problem, solved, warn_of_wide_bounds, tolerance_of(settings))
+        solution = in_a_fitting_box(problem, solved, warn_of_box, tolerance_of(settings))
         solution = replace(solution, compile_time=spent[0], solve_time=spent[1])
         if solution.certified:
             plans, u = solution.plans.astype(float), np.asarray(solution.trajectories.u)

@@ -38,6 +38,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
+from mjx_drax.search.fitting import NARROWER, WIDER
 from mjx_drax.search.iterate import FEASIBLE, identity_of_rows, joined
 from mjx_drax.solution.names import control_names, difference_names, state_names
 
@@ -341,29 +342,30 @@ def warn_of_loose_ends(
             )
 
 
-def warn_of_wide_bounds(problem: Problem, which: np.ndarray, again: bool = True) -> None:
-    """Warn that bounds of entries (nx + nu,) of states and controls were far too wide.
+def warn_of_box(problem: Problem, which: np.ndarray, how: str | None = None) -> None:
+    """Warn that the box of initial knots did not fit entries (nx + nu,) of states and controls.
 
-    And that the problem was solved `again` for it, or else what that means.
+    And that the problem was solved again for it, in a NARROWER box or a WIDER one, or else what
+    bounds that are far too wide mean.
     """
     dynamics = problem.dynamics
     names, give = [*state_names(dynamics), *control_names(dynamics)], "x_scatter and u_scatter"
     if not dynamics.nx:  # a program
         names, give = [f"x[{i}]" for i in range(dynamics.nu)], "a scatter"
-    wide = [name for name, is_wide in zip(names, which, strict=True) if is_wide]
-    more = f" and {len(wide) - FEW} more" if len(wide) > FEW else ""
-    of = f"{', '.join(wide[:FEW])}{more}"
+    those = [name for name, is_one in zip(names, which, strict=True) if is_one]
+    more = f" and {len(those) - FEW} more" if len(those) > FEW else ""
+    of = f"{', '.join(those[:FEW])}{more}"
     share = f"less than a hundredth of the room between the bounds of {of}"
-    told = (
-        f"{problem.name} was solved again, from initial knots nearer to the answer, which uses "
-        f"{share}. Give narrower bounds, or {give}, to solve it once."
-    )
-    if not again:
-        told = (
-            f"motions of {problem.name} use {share}, by which residuals and constraints are "
-            f"measured, so optimal and certified say little. Give narrower bounds, or {give}."
-        )
-    warnings.warn(told, DraxWarning, stacklevel=4)
+    told = {
+        NARROWER: f"{problem.name} was solved again, from initial knots nearer to the answer, "
+        f"which uses {share}. Give narrower bounds, or {give}, to solve it once.",
+        WIDER: f"{problem.name} was solved again, from initial knots as far apart as the answer's "
+        f"are: {of} went far beyond the default ones, by which defects are measured. Give {give} "
+        "to solve it once.",
+        None: f"motions of {problem.name} use {share}, by which residuals and constraints are "
+        f"measured, so optimal and certified say little. Give narrower bounds, or {give}.",
+    }
+    warnings.warn(told[how], DraxWarning, stacklevel=4)
 
 
 def measured(

@@ -1,4 +1,6 @@
-"""Bounds that are far wider than a motion: its box of initial knots, and what that saves."""
+"""Boxes of initial knots that do not fit a motion, and what others save."""
+
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ from builders import point, robot
 
 from mjx_drax import Langevin, from_function, from_program, minimize, solve, solve_batch, tasks
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.search.narrowing import narrowed
+from mjx_drax.search.fitting import narrowed, widened
 
 INF = np.inf
 
@@ -70,6 +72,37 @@ def test_where_f_has_kinks_nothing_is_narrower():
     nx, nu = given.dynamics.nx, given.dynamics.nu
     assert narrowed(given, given, np.zeros((11, nx)), np.zeros((10, nu))) is None
     assert robot().dynamics.kinked is False
+
+
+def test_a_box_that_is_left_far_behind_becomes_twice_as_wide_as_the_motion():
+    given = point(x_init=[5.0, 0.0], x_bounds=([-INF, -50.0], [INF, 50.0]), u_bounds=(0.0, INF))
+    x, u = motion([100.0, 40.0], [1e3, 1e3])
+    problem, which = widened(given, x + np.array([5.0, 0.0]), u)
+    assert which.tolist() == [True, False, False, False]  # the others have a bound
+    assert boxes(problem)[0] == [[-195.0, -50.0], [205.0, 50.0]]
+    assert boxes(problem)[1] == boxes(given)[1]
+    assert widened(problem, x, u) is None
+    near = motion([19.0, 1.0], [1.0, 1.0])[0]
+    assert widened(given, near + np.array([5.0, 0.0]), u) is None
+    assert widened(tasks.load("hopper_jump").make(), np.full((11, 11), 1e6), u) is None
+
+
+@pytest.mark.parametrize("far", [1e5, 1e-2])
+def test_a_motion_far_beyond_the_default_box_is_found(far):
+    problem = runs(
+        np.inf,
+        u_bounds=None,
+        running_cost=None,
+        running_residual=lambda x, u: 0.1 / far * u,
+        terminal_equality=lambda x: x - jnp.array([far, 0.0]),
+    )
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = solve(problem, chains=4)
+    again = any("far beyond the default ones" in str(each.message) for each in told)
+    assert again == (far > 1.0)
+    assert found.optimal
+    assert found.replay_cost[found.best_chain] == pytest.approx(0.07519, rel=1e-3)
 
 
 def runs(bound, **changes):
