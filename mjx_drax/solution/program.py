@@ -37,7 +37,7 @@ from mjx_drax.search.units import to_units
 from mjx_drax.solution.log import history_of, table
 from mjx_drax.solution.progress import reporting
 from mjx_drax.solution.replay import plan_violations
-from mjx_drax.solution.report import INTERRUPTED, counts, html
+from mjx_drax.solution.report import INTERRUPTED, counts, endless, html
 from mjx_drax.solution.results import endings, optimality, stalled_of, statuses, tolerance_of
 from mjx_drax.solution.violations import Violation, most_broken, warn_of_box
 
@@ -141,11 +141,14 @@ class Minimum:
     def _report(self) -> list[str]:
         best, where = self.best_chain, self.where(self.best_chain)
         broken = "" if where is None else f": {where.told(self.program)}"
+        converged = self.residual[best] < self.tolerance
+        fall = endless(self.history["cost"][0], self.cost, converged)
         return [
             *([INTERRUPTED] if self.interrupted else []),
             f"chains         {len(self.cost)}: {counts(self.status)}",
             f"best           cost {self.cost[best]:.5g}, max|h| {self.max_defect[best]:.1e}",
             f"optimality     {optimality(self, best)}",
+            *([f"               {fall}"] if fall else []),
             f"x              {shown([float(f'{x:.6g}') for x in self.best], 160)}",
             f"{self.status[best]}{broken}",
         ]

@@ -50,7 +50,7 @@ def lines(solution: Results) -> list[str]:
         found += f" (polish: {counts(solution.polished)})"
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
-    endless = _endless(solution)
+    fall = _fall(solution)
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -60,7 +60,7 @@ def lines(solution: Results) -> list[str]:
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
         f"optimality     {solution.optimality}",
-        *([f"               {endless}"] if endless and solution.certified else []),
+        *([f"               {fall}"] if fall and solution.certified else []),
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
@@ -171,17 +171,26 @@ def _only(solution: Results) -> str:
     )
 
 
-def _endless(solution: Results) -> str:
-    """What there is to say where the cost seems to have no lower bound; else nothing."""
-    first = np.abs(solution.history["cost"][0])
-    least = np.where(np.isnan(solution.cost), np.inf, solution.cost).min()
-    largest = first[np.isfinite(first)].max(initial=0.0)
+def _fall(solution: Results) -> str:
     converged = solution.residual[solution.best_chain] < solution.tolerance
+    return endless(solution.history["cost"][0], solution.cost, converged)
+
+
+def endless(initial: np.ndarray, cost: np.ndarray, converged: bool) -> str:
+    """What there is to say where the cost seems to have no lower bound; else nothing.
+
+    Args:
+        initial, cost: of initial knots and of chains in the end, (chains,).
+        converged: whether the best chain has.
+    """
+    first = np.abs(initial)
+    least = np.where(np.isnan(cost), np.inf, cost).min()
+    largest = first[np.isfinite(first)].max(initial=0.0)
     if converged or largest == 0.0 or not least < -BOTTOMLESS * largest:
         return ""
     return (
         f"the cost fell from about {largest:.2g} to {least:.2g}, as if it had no lower bound: "
-        "bound the controls and states that it rewards, or add a term that grows with them"
+        "bound what it rewards, or add a term that grows with it"
     )
 
 
@@ -211,8 +220,8 @@ def _advice(solution: Results) -> str:
     """What to try when no chain could be certified; the shell has the same names."""
     if solution.interrupted:
         return "the solve was interrupted. Let it go on to its end."
-    if endless := _endless(solution):
-        return f"{endless}."
+    if fall := _fall(solution):
+        return f"{fall}."
     where = solution.where(solution.best_chain)
     if where is not None and (solution.died_at >= 0).all():
         first = solution.died_at.min()

@@ -202,17 +202,19 @@ class Violation(NamedTuple):
             return "misses the goal"
         if self.knot < 0:
             return f"breaks the {words(self.kind)} {by}"
-        at = f"at knot {self.knot}"
+        at = f" at knot {self.knot}"
         if not problem.dynamics.phases:  # else each chain has times of its own
             at += f", {problem.times[self.knot]:.3g} s"
+        if not problem.dynamics.nx:  # a program
+            at = ""
         name = entry_name(problem, self.kind, self.entry)
         if self.kind == TRACKING:
             return f"ends off the plan in {name} {by}"
         if self.kind.endswith("bounds"):
-            return f"leaves the bounds of {name} {by} {at}"
+            return f"leaves the bounds of {name} {by}{at}"
         if self.kind == DYNAMICS:
-            return f"breaks the dynamics in {name} {by} {at}"
-        return f"breaks {words(self.kind)} {name} {by} {at}"
+            return f"breaks the dynamics in {name} {by}{at}"
+        return f"breaks {words(self.kind)} {name} {by}{at}"
 
     def data(self) -> dict[str, Any]:
         """As files hold it."""

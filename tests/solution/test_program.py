@@ -277,3 +277,15 @@ def test_units_of_constraints_do_not_matter(units):
     assert found.cost == pytest.approx(17.0140173, rel=1e-4)
     assert units * found.equality[0] == pytest.approx([0.161469], rel=1e-2)
     assert units * found.inequality[0] == pytest.approx([0.552294], rel=1e-2)
+
+
+def test_a_cost_without_a_lower_bound_is_told():
+    falls = from_program(2, cost=lambda x: x[1] ** 2 - x[0])
+    assert "as if it had no lower bound: bound what it rewards" in str(minimize(falls, chains=2))
+
+
+def test_a_program_has_no_knots_and_no_times():
+    opposed = from_program(1, cost=lambda x: x @ x, equality=lambda x: jnp.append(x, x - 1.0))
+    last = str(minimize(opposed, chains=2)).splitlines()[-1]
+    assert last.startswith("infeasible: breaks equality [")
+    assert "knot" not in last
