@@ -10,9 +10,9 @@ as far away would need more digits than numbers have.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,10 @@ what stands still says nothing of how far it could have moved."""
 
 BOXES = 3
 """So many times at most."""
+
+PAID, NOTHING = 10.0, 1e-4
+"""A motion that breaks PAID times as much as another one, and more than PAID times the share
+NOTHING of what is allowed, has paid with that for a lower cost; of up to a half."""
 
 NARROWER, WIDER = "narrower", "wider"
 
@@ -86,7 +90,7 @@ def in_a_fitting_box(
             break
         problem, which = fitting
         other = solved(problem)
-        if not is_better(other.problem, answer.knots, answer.cost, other.cost, tolerance):
+        if not is_better(answer, other, tolerance):
             break
         answer, others[how] = other, others[how] | which
     for how, which in others.items():
@@ -101,8 +105,8 @@ def narrowed(
     """The problem with a box of initial knots that fits a motion; None if its own does.
 
     It does if any bounded state, and any bounded control, uses a hundredth of the room: others may
-    hardly be needed. A side that was given, and is not that of the bounds, stays; so do bounds of
-    single knots.
+    hardly be needed. Where no bound is, sides are narrower if no state, or no control, uses that. A
+    side that was given between bounds, and is not theirs, stays; so do bounds of single knots.
 
     Args:
         given: by the user.
@@ -115,30 +119,18 @@ def narrowed(
     """
     if problem.dynamics.kinked:
         return None
-    controls = np.asarray(u)
-    sides: dict[str, Any] = {}
-    which = []
-    for name, moves, about in (("x", x, x[0]), ("u", controls, np.zeros(controls.shape[1]))):
-        ends = f"{name}_lower", f"{name}_upper"
-        bounds, first, box = (
-            [np.asarray(getattr(of, end)) for end in ends]
-            for of in (given.bounds, given.scatter, problem.scatter)
-        )
-        if any(side.ndim != 1 for side in (*bounds, *box)):
-            which.append(np.zeros(len(about), bool))
-            continue
-        extent, width = np.abs(moves - about).max(axis=0, initial=0.0), box[1] - box[0]
-        bounded = np.isfinite(bounds).all(axis=0) & np.equal(bounds, first).all(axis=0)
-        wide = bounded & (extent < REST * width)
+    chosen = []
+    for part in _parts(problem, x, u):
+        first = np.stack([np.asarray(getattr(given.scatter, end)) for end in part.ends])
+        width, extent = part.box[1] - part.box[0], part.extent
+        bounded = np.isfinite(part.bounds).all(axis=0) & (part.bounds == first).all(axis=0)
+        free, little = np.isinf(part.bounds).all(axis=0), extent < REST * width
+        wide = bounded & little
         wide &= (wide == bounded).all()
-        reach = np.where(wide, np.maximum(AROUND * extent, LEAST * width), 0.0)
-        for end, side, new in zip(ends, box, (about - reach, about + reach), strict=True):
-            sides[end] = jnp.asarray(np.where(wide, np.clip(new, *box), side), side.dtype)
-        which.append(wide)
-    changed = np.concatenate(which)
-    if not changed.any():
-        return None
-    return replace(problem, scatter=replace(problem.scatter, **sides)), changed
+        if (little | ~(bounded | free)).all() and extent.any():
+            wide |= free
+        chosen.append((part, wide, np.maximum(AROUND * extent, LEAST * width)))
+    return _with_reaches(problem, chosen)
 
 
 def widened(problem: Problem, x: np.ndarray, u: ArrayLike) -> tuple[Problem, np.ndarray] | None:
@@ -151,38 +143,77 @@ def widened(problem: Problem, x: np.ndarray, u: ArrayLike) -> tuple[Problem, np.
     """
     if problem.dynamics.kinked:
         return None
+    chosen = []
+    for part in _parts(problem, x, u):
+        width, extent = part.box[1] - part.box[0], part.extent
+        free = np.isinf(part.bounds).all(axis=0) & np.isfinite(extent)
+        chosen.append((part, free & (extent > AROUND * width), 2.0 * extent))
+    return _with_reaches(problem, chosen)
+
+
+class Part(NamedTuple):
+    """States or controls of a motion, n entries, and the sides of their boxes.
+
+    Attributes:
+        ends: attributes of boxes, the lower and the upper one.
+        about: what they move about, (n,).
+        extent: how far, (n,).
+        bounds, box: (2, n).
+    """
+
+    ends: tuple[str, str]
+    about: np.ndarray
+    extent: np.ndarray
+    bounds: np.ndarray
+    box: np.ndarray
+
+
+def _parts(problem: Problem, x: np.ndarray, u: ArrayLike) -> Iterator[Part]:
+    """States, which move about x_0, and controls, about 0; without those bounded knot by knot."""
     controls = np.asarray(u)
-    sides: dict[str, Any] = {}
-    which = []
     for name, moves, about in (("x", x, x[0]), ("u", controls, np.zeros(controls.shape[1]))):
-        ends, both = (f"{name}_lower", f"{name}_upper"), (problem.bounds, problem.scatter)
-        bounds, box = ([np.asarray(getattr(of, end)) for end in ends] for of in both)
-        extent = np.abs(moves - about).max(axis=0, initial=0.0)
-        far = np.isinf(bounds).all(axis=0) & np.isfinite(extent)
-        far &= extent > AROUND * (box[1] - box[0])
-        for end, side, new in zip(ends, box, (about - 2 * extent, about + 2 * extent), strict=True):
-            sides[end] = jnp.asarray(np.where(far, new, side), side.dtype)
-        which.append(far)
-    changed = np.concatenate(which)
-    if not changed.any():
+        ends = f"{name}_lower", f"{name}_upper"
+        bounds, box = (
+            [np.asarray(getattr(of, end)) for end in ends]
+            for of in (problem.bounds, problem.scatter)
+        )
+        if all(side.ndim == 1 for side in (*bounds, *box)):
+            extent = np.abs(moves - about).max(axis=0, initial=0.0)
+            yield Part(ends, about, extent, np.stack(bounds), np.stack(box))
+
+
+def _with_reaches(
+    problem: Problem, chosen: Sequence[tuple[Part, np.ndarray, np.ndarray]]
+) -> tuple[Problem, np.ndarray] | None:
+    """The problem with sides of some entries, (n,), that reach so far, and which; None if none."""
+    nx = problem.dynamics.nx
+    which = np.zeros(nx + problem.dynamics.nu, bool)
+    sides: dict[str, Any] = {}
+    for part, entries, reach in chosen:
+        new = np.stack([part.about - reach, part.about + reach])
+        new = np.clip(new, *part.bounds)
+        for end, side, other in zip(part.ends, part.box, new, strict=True):
+            sides[end] = jnp.asarray(np.where(entries, other, side), side.dtype)
+        which[slice(nx) if part.ends[0].startswith("x") else slice(nx, None)] = entries
+    if not which.any():
         return None
-    return replace(problem, scatter=replace(problem.scatter, **sides)), changed
+    return replace(problem, scatter=replace(problem.scatter, **sides)), which
 
 
-def is_better(
-    problem: Problem, knots: Trajectory, cost: float, found: float, tolerance: float
-) -> bool:
-    """Whether what was found in the narrower box takes the place of what was known.
+def is_better(known: Answer[Any], other: Answer[Any], tolerance: float) -> bool:
+    """Whether what was found in another box takes the place of what was known.
 
     Args:
-        problem: with the narrower box, and units of constraints that go with it.
-        knots: of the best chain that was known, (K, ...).
-        cost: of that; infinite if it is not feasible.
-        found: the same of the best chain in the narrower box.
-        tolerance: share of the cost by which it must be cheaper.
+        known: in the wider box, by which it may break more than the other box allows.
+        other: in the box that fits better.
+        tolerance: share of the cost by which it must be cheaper, unless the known one has PAID.
     """
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], replace(knots, slack=None))
-    feasible = float(evaluate(problem, one).max_defect[0]) < FEASIBLE
-    if not feasible and np.isfinite(cost):
+    knots = [jax.tree.map(jnp.asarray, replace(of.knots, slack=None)) for of in (known, other)]
+    both = jax.tree.map(lambda *rows: jnp.stack(rows), *knots)
+    broken, less = np.asarray(evaluate(other.problem, both).max_defect, float)
+    if not np.isfinite(known.cost):
+        return bool(np.isfinite(other.cost))
+    if not broken < FEASIBLE:
         return True  # it was feasible in the units of the wide box alone
-    return found < cost - tolerance * abs(cost) if np.isfinite(cost) else bool(np.isfinite(found))
+    paid = broken > PAID * max(less, NOTHING * FEASIBLE)
+    return other.cost < known.cost + (1.0 if paid else -tolerance) * abs(known.cost)

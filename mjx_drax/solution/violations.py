@@ -357,7 +357,7 @@ def warn_of_box(problem: Problem, which: np.ndarray, how: str | None = None) -> 
     those = [name for name, is_one in zip(names, which, strict=True) if is_one]
     more = f" and {len(those) - FEW} more" if len(those) > FEW else ""
     of = f"{', '.join(those[:FEW])}{more}"
-    share = f"less than a hundredth of the room between the bounds of {of}"
+    share = f"less than a hundredth of the room that {of} have, between bounds or by default"
     told = {
         NARROWER: f"{problem.name} was solved again, from initial knots nearer to the answer, "
         f"which uses {share}. Give narrower bounds, or {give}, to solve it once.",

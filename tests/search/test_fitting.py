@@ -9,7 +9,8 @@ from builders import point, robot
 
 from mjx_drax import Langevin, from_function, from_program, minimize, solve, solve_batch, tasks
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.search.fitting import narrowed, widened
+from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.fitting import Answer, is_better, narrowed, widened
 
 INF = np.inf
 
@@ -51,6 +52,37 @@ def test_a_box_of_which_something_is_used_stays():
     assert narrowed(by_knot, by_knot, x, u) is None
 
 
+def test_where_no_bound_is_a_box_is_narrower_if_nothing_uses_it():
+    given = point(x_bounds=([-INF, -1e3], [INF, 1e3]))
+    x, u = motion([1e-3, 1e-2], [2e-3, 0.0])
+    problem, which = narrowed(given, given, x, u)
+    assert which.tolist() == [True, True, True, True]
+    np.testing.assert_allclose(boxes(problem)[0][1], [1e-2, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(boxes(problem)[1][1], [2e-2, 2e-3], rtol=1e-6)
+    _, which = narrowed(given, given, x, 100.0 * u)  # what is free and used stays
+    assert which.tolist() == [True, True, False, False]
+    _, which = narrowed(given, given, 1e3 * x, u)
+    assert which.tolist() == [False, True, True, True]
+    assert narrowed(given, given, 1e5 * x, 100.0 * u) is None
+
+
+def test_a_cost_that_was_paid_for_with_violations_gives_way():
+    problem = point(running_residual=lambda x, u: u, terminal_equality=lambda x: x - 1.0)
+
+    def answer(miss, cost):
+        x = jnp.linspace(0.1, 1.0, 10)[:, None] * jnp.ones(2) * (1.0 - miss)
+        knots = Trajectory(x, jnp.ones((10, 2)) * (1.0 - miss))
+        return Answer(None, problem, np.zeros((11, 2)), knots, cost, False)
+
+    exact = answer(0.0, 1.0)
+    assert is_better(answer(1e-4, 0.9), exact, 1e-4)
+    assert not is_better(answer(1e-4, 0.4), exact, 1e-4)  # it is another motion
+    assert not is_better(answer(0.0, 0.9), exact, 1e-4)
+    assert is_better(answer(0.0, 1.01), exact, 1e-4)
+    assert not is_better(answer(0.0, 1.00001), exact, 1e-4)
+    assert is_better(answer(0.1, 0.1), exact, 1e-4)  # it is not feasible
+
+
 def test_states_count_from_where_they_start():
     given = point(x_init=[100.0, -3.0], x_bounds=(-1e4, 1e4))
     x, u = motion([1.0, 1.0], [0.5, 0.5])
@@ -82,13 +114,15 @@ def test_a_box_that_is_left_far_behind_becomes_twice_as_wide_as_the_motion():
     assert boxes(problem)[0] == [[-195.0, -50.0], [205.0, 50.0]]
     assert boxes(problem)[1] == boxes(given)[1]
     assert widened(problem, x, u) is None
+    by_knot = point(x_bounds=(-INF * np.ones((10, 2)), INF))
+    assert widened(by_knot, 1e3 * x, 0.0 * u) is None
     near = motion([19.0, 1.0], [1.0, 1.0])[0]
     assert widened(given, near + np.array([5.0, 0.0]), u) is None
     assert widened(tasks.load("hopper_jump").make(), np.full((11, 11), 1e6), u) is None
 
 
-@pytest.mark.parametrize("far", [1e5, 1e-2])
-def test_a_motion_far_beyond_the_default_box_is_found(far):
+@pytest.mark.parametrize("far", [1e5, 1e-2, 1e-4, 1e-6])
+def test_motions_that_do_not_fit_the_default_box_are_found(far):
     problem = runs(
         np.inf,
         u_bounds=None,
@@ -99,8 +133,8 @@ def test_a_motion_far_beyond_the_default_box_is_found(far):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         found = solve(problem, chains=4)
-    again = any("far beyond the default ones" in str(each.message) for each in told)
-    assert again == (far > 1.0)
+    for words, expected in (("beyond the default ones", far > 1.0), ("by default", far < 1e-3)):
+        assert any(words in str(each.message) for each in told) == expected
     assert found.optimal
     assert found.replay_cost[found.best_chain] == pytest.approx(0.07519, rel=1e-3)
 
@@ -123,7 +157,7 @@ def runs(bound, **changes):
 
 @pytest.mark.parametrize("bound", [1e3, 1e7])
 def test_wide_bounds_do_not_hide_that_a_motion_is_no_optimum(bound):
-    with pytest.warns(DraxWarning, match="solved again.*bounds of u0"):
+    with pytest.warns(DraxWarning, match="solved again.*u0 have, between bounds"):
         found = solve(runs(bound), chains=4)
     assert found.optimal
     assert found.replay_cost[found.best_chain] == pytest.approx(20.0, rel=1e-3)
@@ -147,7 +181,7 @@ def test_programs_with_wide_bounds_end_at_their_optimum():
     program = from_program(
         1, cost=lambda x: x[0] ** 2, inequality=lambda x: 1.5 - x, bounds=(-1e6, 1e6)
     )
-    with pytest.warns(DraxWarning, match=r"bounds of x\[0\].*narrower bounds, or a scatter"):
+    with pytest.warns(DraxWarning, match=r"room that x\[0\] have.*narrower bounds, or a scatter"):
         found = minimize(program, chains=4)
     assert found.optimal
     assert found.best[0] == pytest.approx(1.5, rel=1e-3)
