@@ -17,7 +17,8 @@ from mjx_drax.kernels.riccati_cuda import WARP, tile, triangle
 
 KERNEL = Path(__file__).with_name("constraints.cu")
 
-MAX_THREADS = 128
+MAX_THREADS, MOST_TILES = 128, 4
+"""In a block; and that a thread may have, as more would not fit its registers."""
 
 ITERATIONS, SIZES = 20, 16
 """Most iterations, and how many step sizes each chooses from, 1, 1/2, 1/4, ..., and one between."""
@@ -28,8 +29,9 @@ DIGITS = 32.0
 
 def serves(rows: int, nv: int, itemsize: int) -> bool:
     """Whether there is such a GPU, and what J (rows, nv) needs fits its shared memory."""
-    needed = shared_numbers(rows, nv, threads_for(rows, nv)) * itemsize
-    return needed <= cuda.shared_memory()
+    threads = threads_for(rows, nv)
+    fits = tiles(nv) <= MOST_TILES * threads
+    return fits and shared_numbers(rows, nv, threads) * itemsize <= cuda.shared_memory()
 
 
 def minima(arrays: Sequence[Array]) -> Array:
@@ -62,9 +64,14 @@ def minima(arrays: Sequence[Array]) -> Array:
 
 def threads_for(rows: int, nv: int) -> int:
     """Threads that work on a state: one for each tile, or for each two rows, if these are more."""
-    blocks = -(-nv // tile(nv))
-    work = max(triangle(blocks) + blocks, rows // 2)
+    work = max(tiles(nv), rows // 2)
     return min(-(-work // WARP) * WARP, MAX_THREADS)
+
+
+def tiles(nv: int) -> int:
+    """Tiles of [H; g']: COUNT in the kernel."""
+    blocks = -(-nv // tile(nv))
+    return triangle(blocks) + blocks
 
 
 def shared_numbers(rows: int, nv: int, threads: int) -> int:

@@ -124,7 +124,7 @@ def narrowed(
         first = np.stack([np.asarray(getattr(given.scatter, end)) for end in part.ends])
         width, extent = part.box[1] - part.box[0], part.extent
         bounded = np.isfinite(part.bounds).all(axis=0) & (part.bounds == first).all(axis=0)
-        free, little = np.isinf(part.bounds).all(axis=0), extent < REST * width
+        free, little = part.free, extent < REST * width
         wide = bounded & little
         wide &= (wide == bounded).all()
         if (little | ~(bounded | free)).all() and extent.any():
@@ -146,8 +146,8 @@ def widened(problem: Problem, x: np.ndarray, u: ArrayLike) -> tuple[Problem, np.
     chosen = []
     for part in _parts(problem, x, u):
         width, extent = part.box[1] - part.box[0], part.extent
-        free = np.isinf(part.bounds).all(axis=0) & np.isfinite(extent)
-        chosen.append((part, free & (extent > AROUND * width), 2.0 * extent))
+        far = part.free & (extent > AROUND * width) & np.isfinite(extent)
+        chosen.append((part, far, 2.0 * extent))
     return _with_reaches(problem, chosen)
 
 
@@ -159,6 +159,7 @@ class Part(NamedTuple):
         about: what they move about, (n,).
         extent: how far, (n,).
         bounds, box: (2, n).
+        free: which have no bounds, (n,); further states, chosen for a whole motion, count as bound.
     """
 
     ends: tuple[str, str]
@@ -166,6 +167,7 @@ class Part(NamedTuple):
     extent: np.ndarray
     bounds: np.ndarray
     box: np.ndarray
+    free: np.ndarray
 
 
 def _parts(problem: Problem, x: np.ndarray, u: ArrayLike) -> Iterator[Part]:
@@ -179,7 +181,9 @@ def _parts(problem: Problem, x: np.ndarray, u: ArrayLike) -> Iterator[Part]:
         )
         if all(side.ndim == 1 for side in (*bounds, *box)):
             extent = np.abs(moves - about).max(axis=0, initial=0.0)
-            yield Part(ends, about, extent, np.stack(bounds), np.stack(box))
+            given = problem.dynamics.given_nx if name == "x" else len(extent)
+            free = np.isinf(np.stack(bounds)).all(axis=0) & (np.arange(len(extent)) < given)
+            yield Part(ends, about, extent, np.stack(bounds), np.stack(box), free)
 
 
 def _with_reaches(

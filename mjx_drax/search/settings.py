@@ -133,8 +133,15 @@ def changed(solver: Restarts, name: str, text: str) -> Restarts:
     Raises:
         DraxError: no such setting, or a value of the wrong type; says which there are.
     """
-    if name not in names(solver):
-        raise DraxError(f"there is no setting {name!r}: choose one of {', '.join(names(solver))}.")
+    known = names(solver)
+    part, _, inside = name.partition(".")
+    if name not in known and part in ("polish", "rollouts"):
+        raise DraxError(
+            f"there is no setting {name!r}, as {part} is {shown(getattr(solver, part))}: give all "
+            f"of it, as in {part}={part.title()}({inside}={text})."
+        )
+    if name not in known:
+        raise DraxError(f"there is no setting {name!r}: choose one of {', '.join(known)}.")
     out: Restarts = _changed(solver, name.split("."), name, text)
     return out
 

@@ -173,12 +173,17 @@ def test_the_kernel_finds_the_same_accelerations(make):
         (5, 7, np.float32),
     ],
 )
-def test_the_kernel_of_cuda_finds_the_same_accelerations(nv, m, dtype, tmp_path, monkeypatch):
+@pytest.mark.parametrize("iterations", [1, 20])
+def test_the_kernel_of_cuda_finds_the_same_accelerations(
+    nv, m, dtype, iterations, tmp_path, monkeypatch
+):
     calls = []
     monkeypatch.setattr(constraints_cuda.cuda, "call", caller(tmp_path, calls))
+    for module in (constraints_cuda, constraint_solver):
+        monkeypatch.setattr(module, "ITERATIONS", iterations)
     with jax.enable_x64(dtype == np.float64):
         given = jax.tree.map(lambda a: jnp.asarray(a, dtype), drawn(3, nv, m))
-        wanted, _ = jax.jit(jax.vmap(constrained_minimum))(given)
+        wanted, _ = jax.jit(jax.vmap(lambda given: constraint_solver._plain(given)))(given)
         found = constraints_cuda.minima(given[:-1])
     close = 1e-9 if dtype == np.float64 else 1e-4
     np.testing.assert_allclose(found, wanted, rtol=close, atol=close)
@@ -197,6 +202,10 @@ def test_which_kernel_a_gpu_takes(monkeypatch):
     for memory, of_each in ((227 * 1024, ["cuda", minima, "cuda"]), (0, [minima, minima, None])):
         monkeypatch.setattr(constraints_cuda.cuda, "shared_memory", lambda memory=memory: memory)
         assert [taken(given) for given in (limits, contacts, in_float64)] == of_each
+    monkeypatch.setattr(constraints_cuda.cuda, "shared_memory", lambda: 227 * 1024)
+    served = [constraints_cuda.serves(112, nv, 4) for nv in (35, 100, 160)]
+    assert served == [True, True, False]  # registers end before shared memory
+    assert not constraints_cuda.serves(2000, 35, 4)
 
 
 def test_changes_are_those_of_a_function_whose_slope_is_the_law():

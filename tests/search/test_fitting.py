@@ -97,6 +97,8 @@ def test_what_is_chosen_for_a_whole_motion_is_not_taken_for_standing_still():
     whole = np.tile(np.asarray(given.x_init), (11, 1))
     whole[:, :2] += x
     assert narrowed(given, given, whole, u) is None
+    _, which = narrowed(given, given, np.tile(whole[:1], (11, 1)) + 1e-4 * whole, u)
+    assert which.tolist() == [True, True, False, False, False]
 
 
 def test_where_f_has_kinks_nothing_is_narrower():

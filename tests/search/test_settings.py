@@ -72,6 +72,7 @@ def test_an_end_that_was_final_stays_so():
             r"there is no setting 'attempt': choose one of flow.iterations, .*attempts",
         ),
         ("flow", "3", "there is no setting 'flow'"),
+        ("polish.iterations", "300", r"polish is None: give .* polish=Polish\(iterations=300\)"),
         ("attempts", "2.5", "attempts is '2.5': give a whole number; it was 5"),
         ("attempts", "True", "give a whole number"),
         ("attempts", "many", "give a whole number"),
