@@ -150,9 +150,7 @@ def unset(like: Chains, rows: int) -> Chains:
     """Places on the host for the best of so many chains, infinitely bad so far."""
     empty: Chains = jax.tree.map(lambda a: np.zeros((rows, *a.shape[1:]), a.dtype), slim(like))
     worst: Info = jax.tree.map(lambda a: np.full(rows, np.inf), like.info)  # an array each
-    never: Any = np.full(rows, -1, empty.state.died_at.dtype)
-    state = replace(empty.state, died_at=never)
-    return replace(empty, state=state, info=worst, feasible_since=np.full(rows, -1))
+    return replace(empty, info=worst, feasible_since=np.full(rows, -1))
 
 
 def improved(kept: Chains, found: Chains, floor: np.ndarray | float) -> np.ndarray:

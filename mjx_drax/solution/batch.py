@@ -178,7 +178,8 @@ class BatchSolution:
     @property
     def status(self) -> list[str]:
         """`optimal`, `feasible`, `infeasible`, `diverged` or `interrupted`, of every problem."""
-        return statuses(self.feasible, self.optimal, self.died_at >= 0, self.interrupted)
+        begun = (self.died_at > 0) | (not self.interrupted)  # rows that were never filled hold 0
+        return statuses(self.feasible, self.optimal, (self.died_at >= 0) & begun, self.interrupted)
 
     def where(self, i: int) -> Violation | None:
         """What keeps problem i from being certified; None if it is.
