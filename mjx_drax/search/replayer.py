@@ -212,22 +212,43 @@ class Replayer:
         return np.concatenate([self.family.starts(self.indices, knots)[:, None], knots.x], axis=1)
 
     def _by_the_engine(self, info: Info, knots: Trajectory, chosen: np.ndarray) -> Info:
-        """Diagnostics of rollouts; max|h| of `chosen` ones (rows,) as the replaying engine has it.
+        """`by_the_engine` of these chains."""
+        return by_the_engine(
+            self.family, self.question, self.of, info, knots, self._plans(knots), chosen
+        )
 
-        Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
-        is a motion of the engine: where it reaches the goal it counts, if it keeps the constraints.
-        """
-        family, defect = self.family, np.array(info.max_defect)
-        which = np.flatnonzero(chosen & ~(defect < FEASIBLE))
-        if not (family.kinked and len(which)):
-            return info
-        broken, unit = map(np.asarray, worst_and_unit(self.question[1], self.question[0], knots))
-        plan, u = self._plans(knots), np.asarray(knots.u)
-        for index in np.unique(self.of[which]):
-            problem, rows = family.at(int(index)), which[self.of[which] == index]
-            off = problem.engine_defects(plan[rows], u[rows]) / unit[rows, None]
-            defect[rows] = np.maximum(off.max(axis=(1, 2)), broken[rows])
-        return replace(info, max_defect=jnp.asarray(defect))
+
+def by_the_engine(
+    family: Family,
+    question: tuple[Question, Question],
+    of: np.ndarray,
+    info: Info,
+    knots: Trajectory,
+    plans: np.ndarray,
+    chosen: np.ndarray,
+) -> Info:
+    """Diagnostics of rollouts; max|h| of `chosen` ones (rows,) as the replaying engine has it.
+
+    Where f has kinks it may differ from the engine by more than a feasible plan may. A rollout
+    is a motion of the engine: where it reaches the goal it counts, if it keeps the constraints.
+
+    Args:
+        family, question: the problems, and what rows share and have of their own.
+        of: the problem of each row, (rows,).
+        info, knots, plans: of the rows; plans are x_0..x_K, (rows, K + 1, nx).
+        chosen: the rows.
+    """
+    defect = np.array(info.max_defect)
+    which = np.flatnonzero(chosen & ~(defect < FEASIBLE))
+    if not (family.kinked and len(which)):
+        return info
+    broken, unit = map(np.asarray, worst_and_unit(question[1], question[0], knots))
+    u = np.asarray(knots.u)
+    for index in np.unique(of[which]):
+        problem, rows = family.at(int(index)), which[of[which] == index]
+        off = problem.engine_defects(plans[rows], u[rows]) / unit[rows, None]
+        defect[rows] = np.maximum(off.max(axis=(1, 2)), broken[rows])
+    return replace(info, max_defect=jnp.asarray(defect))
 
 
 def _only(chains: Chains, rows: np.ndarray) -> Chains:

@@ -15,6 +15,7 @@ from mjx_drax.method.descent import Info
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import Question, evaluate, partition, residuals
+from mjx_drax.search.replayer import by_the_engine
 from mjx_drax.search.units import to_units
 from mjx_drax.solution import report, worst
 from mjx_drax.solution.files.load import load
@@ -120,10 +121,12 @@ class Solution(Results):
         """Where the plans are by the problem's functions, and their residuals (chains,)."""
         problem, known = self.problem, (self.trajectories, self.multipliers)
         knots, multipliers = to_units(problem, *jax.tree.map(jnp.asarray, known))
-        info = evaluate(problem, knots)
+        shared, own = question = partition(Question(self.solver.flow, problem), None)
+        of, family = np.zeros(self.chains, int), Family.of_one(problem)
+        info, bare = evaluate(problem, knots), replace(knots, slack=None)
+        info = by_the_engine(family, question, of, info, bare, self.plans, self.feasible)
         if multipliers.bounds is None:  # nothing was polished
             return info, self.residual
-        shared, own = partition(Question(self.solver.flow, problem), None)
         found = np.asarray(residuals(own, shared, knots, multipliers))
         return info, np.maximum(self.residual, found)
 

@@ -202,11 +202,9 @@ class Violation(NamedTuple):
             return "misses the goal"
         if self.knot < 0:
             return f"breaks the {words(self.kind)} {by}"
-        at = f" at knot {self.knot}"
-        if not problem.dynamics.phases:  # else each chain has times of its own
+        at = f" at knot {self.knot}" if problem.dynamics.nx else ""  # a program has none
+        if at and not problem.dynamics.phases:  # else each chain has times of its own
             at += f", {problem.times[self.knot]:.3g} s"
-        if not problem.dynamics.nx:  # a program
-            at = ""
         name = entry_name(problem, self.kind, self.entry)
         if self.kind == TRACKING:
             return f"ends off the plan in {name} {by}"

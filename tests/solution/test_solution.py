@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import Bouncing, made_up, point
+from builders import Bouncing, bouncing, made_up, point
 from jax.tree_util import Partial
 
 from mjx_drax import (
@@ -23,6 +23,7 @@ from mjx_drax.search import engine
 from mjx_drax.search.engine import REPORT_EVERY
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import evaluate, iterate
+from mjx_drax.solution import solution as solutions
 from mjx_drax.solution.replay import replays
 from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
@@ -582,3 +583,22 @@ def test_a_motion_may_start_and_end_on_its_bounds():
     free = solve(reach(), chains=4)
     assert kept.optimal_chains.all()
     np.testing.assert_allclose(kept.cost, free.cost.min(), rtol=1e-3)
+
+
+def test_where_f_has_kinks_plans_that_counted_are_judged_by_the_engine(monkeypatch):
+    """f may differ from it by more than a plan may: in contacts of MJX, in float32."""
+    found = solve(bouncing(), chains=2)
+    assert found.feasible.all()
+
+    def far_off(problem, knots):
+        return replace(evaluate(problem, knots), max_defect=jnp.ones(2))
+
+    monkeypatch.setattr(solutions, "evaluate", far_off)
+    again = found.certify()
+    assert again.feasible.all()
+    assert (again.max_defect < 1e-3).all()
+    infeasible = replace(found, max_defect=np.ones(2, np.float32)).certify()
+    assert not infeasible.feasible.any()
+    away = np.linspace(0.0, 1.0, found.problem.horizon)[:, None]
+    moved = replace(found.trajectories, x=found.trajectories.x + away)
+    assert not replace(found, trajectories=moved).certify().feasible.any()
