@@ -19,12 +19,14 @@ pytestmark = pytest.mark.skipif(not shutil.which("g++"), reason="it needs a C++ 
 def on_cpu(tmp_path, monkeypatch):
     """Kernels that are called from now on are compiled for this CPU; their sizes, in a list."""
     calls = []
-    call = caller(tmp_path, calls)
+    call = caller(tmp_path, calls, "LEFT")
 
     def checked(source, kernel, sizes, blocks, warps, shared, arrays, shapes, numbers):
         chains = max(32 // sizes["THREADS"], 1)
         assert blocks * chains >= arrays[0].shape[0] > (blocks - 1) * chains
-        return call(source, kernel, sizes, blocks, warps, shared, arrays, shapes, numbers)
+        found = call(source, kernel, sizes, blocks, warps, shared, arrays, shapes, numbers)
+        assert shapes[-1][-1] == calls[-1]["LEFT"]
+        return found
 
     monkeypatch.setattr(riccati_cuda.cuda, "call", checked)
     return calls
