@@ -14,9 +14,10 @@ from mjx_drax.physics.engine import mujoco as mujoco  # first: it says what is w
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     from mujoco import mjx as mjx
 
-    # Not public: what MJX can collide, and how; hulls of meshes; frames of contacts; the law of
-    # constraint forces
+    # Not public: what MJX can collide, and how; hulls of meshes; frames of contacts; rows of
+    # constraints
     from mujoco.mjx._src import collision_driver as collision_driver
+    from mujoco.mjx._src import constraint as constraint
     from mujoco.mjx._src import mesh as meshes  # noqa: F401
     from mujoco.mjx._src.collision_convex import _manifold_points as four_of  # noqa: F401
     from mujoco.mjx._src.collision_driver import (

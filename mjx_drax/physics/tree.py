@@ -218,15 +218,26 @@ def accelerations(model: mjx.Model, data: mjx.Data) -> Array:
     return _summed(_Sums.of(model).moves, data.cdof_dot * data.qvel[:, None])
 
 
+def motions(model: mjx.Model, data: mjx.Data, velocity: Array, bodies: np.ndarray) -> Array:
+    """Those of bodies (n,), (n, 6), as cvel is, at a velocity of joints (nv,)."""
+    return _summed(_Sums.of(model).moves[bodies], data.cdof * velocity[:, None])
+
+
+def joint_forces(
+    model: mjx.Model, data: mjx.Data, wrenches: Array, bodies: np.ndarray | slice = slice(None)
+) -> Array:
+    """Forces on joints (nv,) of torques and forces on bodies (n,), (n, 6), about what cvel is."""
+    return jnp.sum(data.cdof * _summed(_Sums.of(model).moves[bodies].T, wrenches), axis=1)
+
+
 def rne(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.rne`: `data` with the forces qfrc_bias (nv,) of gravity and velocities."""
-    moves, inertia = _Sums.of(model).moves, internal(data).cinert
-    acceleration = accelerations(model, data)
+    inertia, acceleration = internal(data).cinert, accelerations(model, data)
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
         acceleration = acceleration - jnp.concatenate([jnp.zeros(3), model.opt.gravity])
     momentum = _inertia_times(inertia, data.cvel)
     force = _inertia_times(inertia, acceleration) + _crossed_force(data.cvel, momentum)
-    return data.replace(qfrc_bias=jnp.sum(data.cdof * _summed(moves.T, force), axis=1))
+    return data.replace(qfrc_bias=joint_forces(model, data, force))
 
 
 def inverse_derivatives(
