@@ -288,7 +288,8 @@ class compiled:
         except kept.CannotBeKept:
             return None
         if program is None:
-            lowered = self.traced.lower(**every, **static)
+            with kept.without_locations():
+                lowered = self.traced.lower(**every, **static)
             if (begin := _waiting.get()) is not None:
                 begin()
             with kept.unknown_to_jax():

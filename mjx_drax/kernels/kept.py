@@ -31,8 +31,13 @@ from mjx_drax.base.files import complete
 ENABLED, FOLDER = "jax_enable_compilation_cache", "jax_compilation_cache_dir"
 """JAX's settings of its own cache, which also say whether programs are kept here, and where."""
 
+LOCATIONS = "jax_traceback_in_locations_limit"
+"""JAX's setting of how many lines of code a program tells of each of its operations."""
+
 _LOADED = time.time()
 _lock, _compiling = Lock(), [0]
+_told: list[int] = []
+"""How many lines were told, once for each that is in `without_locations`."""
 
 
 class CannotBeKept(Exception):
@@ -140,6 +145,24 @@ def unknown_to_jax() -> Iterator[None]:
                 _use_cache(True)
 
 
+@contextmanager
+def without_locations() -> Iterator[None]:
+    """Lower programs that do not tell which lines of code their operations come from.
+
+    XLA reads that anew with each program that it loads, which takes longer than the rest.
+    """
+    with _lock:
+        _told.append(_told[0] if _told else jax.config.values[LOCATIONS])
+        jax.config.update(LOCATIONS, 0)
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _told.pop()
+            if not _told:  # the last one, of all threads
+                jax.config.update(LOCATIONS, before)
+
+
 def _use_cache(used: bool) -> None:
     jax.config.update(ENABLED, used)
     compilation_cache.reset_cache()  # it asks once whether it is used
@@ -155,7 +178,8 @@ def _place(key: str) -> Path | None:
 
 def surroundings() -> str:
     """What the same program depends on besides: versions, machine, settings of JAX and XLA."""
-    settings = {k: v for k, v in jax.config.values.items() if k not in (ENABLED, FOLDER)}
+    changed = ENABLED, FOLDER, LOCATIONS  # also by other threads, meanwhile
+    settings = {k: v for k, v in jax.config.values.items() if k not in changed}
     wide = jnp.result_type(float)  # a context may have changed what the settings say
     return repr((_machine(), str(wide), os.environ.get("XLA_FLAGS"), sorted(settings.items())))
 

@@ -179,6 +179,25 @@ def test_jax_keeps_its_own_cache_for_all_else():
     assert jax.config.values[kept.ENABLED] == before
 
 
+def test_kept_programs_do_not_tell_the_lines_of_their_code():
+    used = program()
+    used(X, 3)
+    (known,) = used._programs.values()
+    assert "multiply" in known.as_text()
+    assert "stack_frame_id" not in known.as_text()
+    assert "stack_frame_id" in used.lower(X, 3).compile().as_text()
+
+
+def test_lines_of_code_are_told_again_once_nobody_leaves_them_out():
+    before, surroundings = jax.config.values[kept.LOCATIONS], kept.surroundings()
+    with kept.without_locations():
+        with kept.without_locations():
+            assert jax.config.values[kept.LOCATIONS] == 0 != before
+        assert jax.config.values[kept.LOCATIONS] == 0
+        assert kept.surroundings() == surroundings
+    assert jax.config.values[kept.LOCATIONS] == before
+
+
 def test_settings_that_a_context_changes_are_other_programs():
     draw = compiled(
         jax.random.normal, key=lambda key, **rest: "d", static_argnames=("shape", "dtype")
