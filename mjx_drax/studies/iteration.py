@@ -1,14 +1,14 @@
 """Times of the parts of an iteration: f, its Jacobians, the Riccati recursion, and the whole.
 
-    python -m mjx_drax.studies.iteration TASK[:CHAINS] ... [--horizon S] [--repeats N]
+    python -m mjx_drax.studies.iteration TASK[:CHAINS] ... [--horizon S] [--repeats N] [--path DIR]
 
 A row for each task and number of chains, in milliseconds: f at all knots, Jacobians of f at all
 knots, one recursion with noise and gains, an iteration with noise, one of the noise-free tail, and
 one of the polish. Line searches evaluate f at each knot: that of the tail 5 times, that of the
 polish 14 times on GPUs, and on CPUs as often as it needs. Plans last as long as the task's, or S
-seconds. Times are medians of calls in one process; the last column is the time that all of these
-took to compile, in seconds. To compare two versions, run this file with PYTHONPATH set to either
-checkout.
+seconds. Robots of `studies.robots` are tasks, too; DIR is where their packages' files lie. Times
+are medians of calls in one process; the last column is the time that all of these took to compile,
+in seconds. To compare two versions, run this file with PYTHONPATH set to either checkout.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mjx_drax import Autodiff, tasks
+from mjx_drax import Autodiff
+from mjx_drax.kernels.compilation import compiled
 from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.method.model import linearize
@@ -31,7 +34,8 @@ from mjx_drax.polish.interior_point import Polish, begin_inside
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, iteration, start
-from mjx_drax.studies.recursion import batch, timed
+from mjx_drax.studies.recursion import batch
+from mjx_drax.studies.robots import named
 
 TASKS = ("quadruped_step:32", "humanoid_stand:32", "quadruped_step:1", "humanoid_stand:1")
 
@@ -58,9 +62,14 @@ def times(problem: Problem, chains: int, repeats: int) -> tuple[list[float], flo
     seconds, compiling = [], 0.0
     for part, arguments in parts:
         clock = time.perf_counter()
-        program = jax.jit(full_precision(jax.vmap(part))).lower(*arguments).compile()
+        program = compiled(full_precision(jax.vmap(part))).lower(*arguments).compile()
         compiling += time.perf_counter() - clock
-        seconds.append(timed(program, arguments, repeats)[0])
+        jax.block_until_ready(program(*arguments))
+        clocks = [time.perf_counter()]
+        for _ in range(repeats):
+            jax.block_until_ready(program(*arguments))
+            clocks.append(time.perf_counter())
+        seconds.append(float(np.median(np.diff(clocks))))
     return seconds, compiling
 
 
@@ -70,6 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("tasks", nargs="*", default=TASKS, metavar="TASK[:CHAINS]")
     parser.add_argument("--horizon", type=float, metavar="S", help="duration of the plans [s]")
     parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--path", type=Path, metavar="DIR", help="of the packages of robots")
     options = parser.parse_args(arguments)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, milliseconds\n")
     print("| task | K | chains | f | Jacobians | recursion | noise | tail | polish | compile [s] |")
@@ -77,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     own = {} if options.horizon is None else {"horizon": options.horizon}
     for word in options.tasks:
         name, _, chains = word.partition(":")
-        problem = tasks.load(name).make(**own)
+        problem = named(name, options.path, **own)
         seconds, compiling = times(problem, int(chains or 32), options.repeats)
         row = " | ".join(f"{1e3 * part:.2f}" for part in seconds)
         print(

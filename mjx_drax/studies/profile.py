@@ -1,12 +1,13 @@
 """Which GPU kernels an iteration runs, and how long the GPU waits between them.
 
-    python -m mjx_drax.studies.profile TASK[:CHAINS] ... [--of KIND] [--iterations N]
+    python -m mjx_drax.studies.profile TASK[:CHAINS] ... [--of KIND] [--iterations N] [--path DIR]
 
 For the flow and for the polish of each task, or with `--of plan` for plans of model predictive
 control: the time of an iteration or a plan, how many kernels it starts, the time in which one of
 them runs, the kernels that take longest, and between which the GPU waits longest, because the host
 decides something or starts the next. Taken from JAX's profiler, in the last of three solves of N
-iterations each, or of three times N plans. The profiler makes waits longer than they are.
+iterations each, or of three times N plans. The profiler makes waits longer than they are. Robots of
+`studies.robots` are tasks, too; DIR is where their packages' files lie.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_drax import tasks
 from mjx_drax.control.mpc import MPC
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.restarts import Restarts, Rollouts
 from mjx_drax.solution.solve import solve
+from mjx_drax.studies.robots import named
 
 
 def kernels(folder: Path) -> list[dict[str, Any]]:
@@ -125,6 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("tasks", nargs="+", metavar="TASK[:CHAINS]")
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--rows", type=int, default=20)
+    parser.add_argument("--path", type=Path, metavar="DIR", help="of the packages of robots")
     parser.add_argument("--of", choices=["flow", "polish", "plan"], help="default flow and polish")
     options = parser.parse_args(arguments)
     n, rows = options.iterations, options.rows
@@ -134,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}")
     for word in options.tasks:
         name, _, chains = word.partition(":")
-        problem = tasks.load(name).make()
+        problem = named(name, options.path)
         count = int(chains or 64)
         for what, solver in (("flow", flow), ("polish", polish)):
             if options.of in (None, what):

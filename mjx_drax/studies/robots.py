@@ -26,6 +26,7 @@ import numpy as np
 from jax import Array
 from jax.tree_util import Partial
 
+from mjx_drax import tasks
 from mjx_drax.base.errors import DraxError, require_positive, require_whole
 from mjx_drax.modelling.terms import Terms
 from mjx_drax.physics.engine import mujoco
@@ -310,6 +311,17 @@ def model_file(inside: str, folder: Path | None = None) -> Path:
     )
 
 
+def named(name: str, folder: Path | None = None, **settings: Any) -> Problem:
+    """The problem of a task of `TASKS`, whose file lies below a folder, or is installed.
+
+    Of another name, that of a task of this project, with these settings.
+    """
+    if name not in TASKS:
+        return tasks.load(name).make(**settings)
+    inside, make = TASKS[name]
+    return replace(make(model_file(inside, folder)), name=name)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Solve and print the table; 0 if every best chain is certified."""
     parser = argparse.ArgumentParser(prog="python -m mjx_drax.studies.robots", description=__doc__)
@@ -336,9 +348,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     certified, refused = True, []
     settings = {"solver": Restarts(attempts=options.attempts), "max_seconds": options.seconds}
     for name in options.names or TASKS:
-        inside, make = TASKS[name]
         try:
-            problem = replace(make(model_file(inside, options.path)), name=name)
+            problem = named(name, options.path)
         except DraxError as error:
             refused.append(f"{name}: {error}")
             continue
