@@ -88,7 +88,9 @@ def _require_no_slips(module: ModuleType, known: set[str], cost: str) -> None:
         if name.startswith("_") or name in known or imported or isinstance(value, ModuleType):
             continue
         alike = FUNCTION_ALIKE if callable(value) else VALUE_ALIKE
-        for meant in difflib.get_close_matches(name.lower(), missing, 1, alike):
+        low = name.lower()
+        near = [meant for meant in missing if sorted(meant) == sorted(low)]  # letters swapped
+        for meant in near or difflib.get_close_matches(low, missing, 1, alike):
             raise DraxError(
                 f"{cost} defines {name}, which is not a known name: rename it to {meant}, or to "
                 f"_{name} if it is something else."

@@ -312,14 +312,14 @@ def warn_of_loose_ends(
     """Warn of constraints at the end that tolerate much of what x_init lacks.
 
     That is where all entries of a kind do, or where one does whose tolerance is no share of the
-    motion but of the scatter box (`STILL`).
+    motion but of the scatter box (`STILL`). A motion that chooses its start may begin at its end.
 
     Args:
         plan, u: all plans that were replayed, x_0..x_K (n, K + 1, nx), and their controls
             (n, K, nu): `measured` is compiled for as many.
         certified: the plan whose certificate counts.
     """
-    if family.problem.terminal_constraint.rows == 0:
+    if family.problem.terminal_constraint.rows == 0 or family.problem.free:
         return
     still = np.repeat(plan[:, :1], plan.shape[1], axis=1), u
     off = np.zeros((len(plan), family.problem.dynamics.ndx))

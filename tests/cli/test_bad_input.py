@@ -112,6 +112,8 @@ COMMANDS = [
     ("cost-x_init", lambda at: own(at, GOOD_COST + "x_init = [1, 2, 3]"), "x_init has 3"),
     ("cost-slip", lambda at: own(at, GOOD_COST + "def terminal_inequalty(data):\n    return 1"),
      "defines terminal_inequalty", "terminal_inequality"),
+    ("cost-slip-swapped", lambda at: own(at, GOOD_COST + "def gaol(data):\n    return True"),
+     "defines gaol", "rename it to goal"),
     ("cost-slip-camel", lambda at: own(at, GOOD_COST + "def runningCost(data, u):\n    return 1"),
      "defines runningCost", "running_cost"),
     ("cost-slip-term", lambda at: own(at, GOOD_COST + "import mjx_drax\nrunning_residul = "

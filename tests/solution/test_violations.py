@@ -435,18 +435,24 @@ def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, 
 
 
 @pytest.mark.parametrize(
-    ("far", "moves", "warned"),
-    [(1e-5, 2e-6, True), (1e-5, 0.5, False), (0.5, 0.5, False), (0.0, 0.0, False)],
-    ids=["fine-axis", "ends-near-its-start", "far", "stays"],
+    ("far", "moves", "start", "warned"),
+    [
+        (1e-5, 2e-6, None, True),
+        (1e-5, 2e-6, ([0.0, -1.0], [0.0, 1.0]), False),
+        (1e-5, 0.5, None, False),
+        (0.5, 0.5, None, False),
+        (0.0, 0.0, None, False),
+    ],
+    ids=["fine-axis", "chosen-start", "ends-near-its-start", "far", "stays"],
 )
-def test_an_entry_that_asks_less_than_the_box_lets_it_is_warned_of(far, moves, warned):
+def test_an_entry_that_asks_less_than_the_box_lets_it_is_warned_of(far, moves, start, warned):
     def step(x, u):
         return x + 0.1 * u
 
     target = jnp.array([1.0, far])
     gantry = from_function(
         step, x_init=[0.0, 0.0], nu=2, horizon=1.0, dt=0.1, running_cost=lambda x, u: u @ u,
-        terminal_equality=lambda x: x - target,
+        terminal_equality=lambda x: x - target, x_init_bounds=start,
     )  # fmt: skip
     x = np.linspace(0.0, [1.0, moves], 11)[None]
     u = np.diff(x, axis=1) / 0.1
