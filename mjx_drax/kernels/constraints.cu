@@ -1,12 +1,14 @@
-// Newton's method of constraint_solver.py without cones, all iterations of a state in one kernel.
-// Names are those of that file.
+// Newton's method of constraint_solver.py, all iterations of a state in one kernel. Names are those
+// of that file, and of elliptic_cones.py.
 //
-// A block of THREADS threads works on a state. Sizes are macros: REAL, NV, NEFC (of J), TILE,
+// A block of THREADS threads works on a state. Sizes are macros: REAL, NV, NLAW (rows of J without
+// cones), C3, C4 and C6 (contacts with cones of so many rows, which follow in that order), TILE,
 // THREADS, and ITERATIONS, SIZES and DIGITS of that file. An iteration eliminates
 //
 //     [H; g']  ->  [. ; -g' H^{-1}]
 //
-// whose sums go over the rows of J that push or bend alone; most contacts of a robot are open.
+// whose sums go over the rows of J that push or bend alone; most contacts of a robot are open. A
+// cone that slides adds two rows to them, J' times the slope of w and times its direction.
 
 #include "tiles.cuh"
 
@@ -14,15 +16,19 @@ constexpr int BV = blocks(NV), PV = BV * TILE;
 constexpr int LV = (BV | 1) * TILE;  // odd: rows begin in different banks
 constexpr int COUNT = triangle(BV) + BV, EACH = (COUNT + THREADS - 1) / THREADS;
 constexpr int PANEL = (BV + 1) * TILE, WARPS = THREADS / 32;
+constexpr int CONTACTS = C3 + C4 + C6, NCONE = 3 * C3 + 4 * C4 + 6 * C6, NEFC = NLAW + NCONE;
+constexpr int MOST = C6 ? 6 : C4 ? 4 : 3, TERMS = NEFC + 2 * CONTACTS;
 
 // Shared memory, in numbers.
-constexpr int M_M = 0, M_J = M_M + PV * LV, M_PANEL = M_J + NEFC * LV;
+constexpr int M_M = 0, M_J = M_M + PV * LV, M_PANEL = M_J + TERMS * LV;
 constexpr int M_A = M_PANEL + 2 * TILE * PANEL, M_REST = M_A + PV, M_PULL = M_REST + PV;
 constexpr int M_GRADIENT = M_PULL + PV, M_DIRECTION = M_GRADIENT + PV, M_ALONG = M_DIRECTION + PV;
-constexpr int M_D = M_ALONG + PV, M_LOWER = M_D + NEFC, M_UPPER = M_LOWER + NEFC;
-constexpr int M_Y = M_UPPER + NEFC, M_H = M_Y + NEFC, M_PUSH = M_H + NEFC, M_BEND = M_PUSH + NEFC;
-constexpr int M_SUMS = M_BEND + NEFC, M_ACTIVE = M_SUMS + 2 * SIZES * WARPS;
-constexpr int SHARED = (M_ACTIVE + NEFC + 7) / 8 * 8;
+constexpr int M_D = M_ALONG + PV, M_LOWER = M_D + NLAW, M_UPPER = M_LOWER + NLAW;
+constexpr int M_SCALE = M_UPPER + NLAW, M_MU = M_SCALE + NCONE, M_WEIGHT = M_MU + CONTACTS;
+constexpr int M_FALLS = M_WEIGHT + CONTACTS, M_TURNS = M_FALLS + NCONE, M_Y = M_TURNS + NCONE;
+constexpr int M_H = M_Y + NEFC, M_PUSH = M_H + NEFC, M_BEND = M_PUSH + TERMS;
+constexpr int M_SUMS = M_BEND + TERMS, M_ACTIVE = M_SUMS + 2 * SIZES * WARPS;
+constexpr int SHARED = (M_ACTIVE + TERMS + 7) / 8 * 8;
 
 constexpr REAL EPS = sizeof(REAL) == 4 ? REAL(1.1920928955078125e-07) : REAL(2.220446049250313e-16);
 constexpr REAL SHORT = DIGITS * EPS * DIGITS * EPS;
@@ -75,8 +81,153 @@ DEVICE Change change(const REAL* memory, int k, REAL size) {
   return {D * moved * (later - there + REAL(0.5) * moved), D * moved * h};
 }
 
+// The rows of a contact with a cone: the first of all that have one, and how many.
+struct Rows {
+  int first, count;
+};
+DEVICE Rows rows_of(int contact) {
+  if (contact < C3) return {3 * contact, 3};
+  if (contact < C3 + C4) return {3 * C3 + 4 * (contact - C3), 4};
+  return {3 * C3 + 4 * C4 + 6 * (contact - C3 - C4), 6};
+}
+#define EACH_ROW \
+  UNROLL         \
+  for (int i = 0; i < MOST; ++i) if (i < rows.count)
+
+enum Zone { OPEN, SLIDES, STICKS };
+
+struct Place {
+  Zone zone;
+  REAL T, w, u[MOST], along[MOST], P[MOST];
+};
+
+// Where u is, with its |t|; tangents are the rows after the first.
+DEVICE void place(Place& at, const Rows& rows, REAL mu, REAL T) {
+  const REAL N = at.u[0];
+  at.T = T, at.w = (N - mu * T) / (1 + mu * mu);
+  at.zone = mu * N + T <= 0 ? STICKS : mu * T > N ? SLIDES : OPEN;
+  EACH_ROW {
+    at.along[i] = i == 0 ? REAL(0) : at.u[i] / (T > 0 ? T : REAL(1));
+    const REAL on_cone = i == 0 ? at.w : -mu * at.w * at.along[i];
+    at.P[i] = at.zone == STICKS ? at.u[i] : at.zone == SLIDES ? on_cone : REAL(0);
+  }
+}
+
+DEVICE void place_now(Place& at, const Rows& rows, const REAL* memory, REAL mu) {
+  REAL squared = 0;
+  EACH_ROW {
+    const REAL u = memory[M_SCALE + rows.first + i] * memory[M_Y + NLAW + rows.first + i];
+    at.u[i] = u;
+    if (i > 0) squared += u * u;
+  }
+  place(at, rows, mu, sqrt(squared));
+}
+
+// The same as `change`, of a contact: see `changes` of elliptic_cones.py.
+DEVICE Change change_of_cone(const REAL* memory, int contact, REAL size) {
+  const Rows rows = rows_of(contact);
+  const REAL mu = memory[M_MU + contact], g = memory[M_WEIGHT + contact], soft = 1 + mu * mu;
+  Place at, later;
+  place_now(at, rows, memory, mu);
+  REAL step[MOST], turn = 0, square = 0;
+  EACH_ROW {
+    const REAL along = memory[M_SCALE + rows.first + i] * memory[M_H + NLAW + rows.first + i];
+    step[i] = size * along;
+    later.u[i] = at.u[i] + step[i];
+    if (i > 0) turn += along * at.u[i], square += along * along;
+  }
+  const REAL more = size * (2 * turn + size * square), before = at.T * at.T;
+  const REAL T = sqrt(larger(before + more, EPS * (before + size * size * square)));
+  place(later, rows, mu, T);
+  const REAL longer = more / (at.T + T > 0 ? at.T + T : REAL(1));
+  const REAL faster = (step[0] - mu * longer) / soft;
+  const bool slides = at.zone == SLIDES && later.zone == SLIDES;
+  const bool sticks = at.zone == STICKS && later.zone == STICKS;
+  REAL squared = 0, turned = 0, inner = 0, slope = 0;
+  EACH_ROW {
+    const REAL bent = i == 0 ? 0 : (step[i] - at.along[i] * longer) / (T > 0 ? T : REAL(1));
+    const REAL slid = i == 0 ? faster : -mu * (faster * later.along[i] + at.w * bent);
+    const REAL moved = slides ? slid : sticks ? step[i] : later.P[i] - at.P[i];
+    const int row = rows.first + i;
+    squared += moved * moved, turned += bent * bent;
+    inner += at.P[i] * (later.u[i] - later.P[i]);
+    slope += g * memory[M_SCALE + row] * moved * memory[M_H + NLAW + row];
+  }
+  if (slides) inner = REAL(0.5) * mu * at.w * (mu * later.u[0] + T) / soft * turned;
+  return {g * (REAL(0.5) * squared - inner), slope};
+}
+
+// Of a row without a cone, or after these of a contact with one.
+DEVICE Change change_of(const REAL* memory, int k, REAL size) {
+  return k < NLAW ? change(memory, k, size) : change_of_cone(memory, k - NLAW, size);
+}
+
+// What contacts with cones add to the rows that push or bend; every lane has one of them.
+DEVICE int add_cones(REAL* memory, int* active, int acting, int warp, int lane) {
+  ROLLED
+  for (int first = 0; first < CONTACTS; first += 32) {
+    const int contact = first + lane;
+    const Rows rows = rows_of(contact);
+    Place at;
+    at.zone = OPEN;
+    if (contact < CONTACTS) place_now(at, rows, memory, memory[M_MU + contact]);
+    const bool acts = at.zone != OPEN, slides = at.zone == SLIDES;
+    const unsigned int in_3 = ballot(acts && rows.count == 3), in_4 = ballot(acts && rows.count == 4);
+    const unsigned int in_6 = ballot(acts && rows.count == 6), sliding = ballot(slides);
+    const unsigned int below = (1u << lane) - 1;
+    if (acts && warp == 0) {
+      const REAL mu = memory[M_MU + contact], g = memory[M_WEIGHT + contact];
+      const REAL share = g / (1 + mu * mu);
+      const REAL bent = slides ? share * mu * (mu * at.T - at.u[0]) / at.T : REAL(0);
+      int to = acting + 3 * ones(in_3 & below) + 4 * ones(in_4 & below) + 6 * ones(in_6 & below);
+      to += 2 * ones(sliding & below);
+      EACH_ROW {
+        const int row = rows.first + i;
+        const REAL scale = memory[M_SCALE + row];
+        active[to] = NLAW + row;
+        memory[M_PUSH + to] = -g * scale * at.P[i];
+        memory[M_BEND + to] = scale * scale * (slides ? (i == 0 ? REAL(0) : bent) : g);
+        memory[M_FALLS + row] = scale * (i == 0 ? REAL(1) : -mu * at.along[i]);
+        memory[M_TURNS + row] = scale * at.along[i];
+        ++to;
+      }
+      if (slides) {
+        active[to] = NEFC + 2 * contact, active[to + 1] = NEFC + 2 * contact + 1;
+        memory[M_PUSH + to] = memory[M_PUSH + to + 1] = 0;
+        memory[M_BEND + to] = share, memory[M_BEND + to + 1] = -bent;
+      }
+    }
+    acting += 3 * ones(in_3) + 4 * ones(in_4) + 6 * ones(in_6) + 2 * ones(sliding);
+  }
+  return acting;
+}
+
+// The two rows of contacts that slide; of the others they are not read.
+DEVICE void combine_rows(REAL* memory, int thread) {
+  ROLLED
+  for (int t = thread; t < CONTACTS * BV; t += THREADS) {
+    const int contact = t / BV, column = t % BV * TILE;
+    const Rows rows = rows_of(contact);
+    REAL falls[TILE] = {}, turns[TILE] = {};
+    ROLLED
+    for (int i = 0; i < rows.count; ++i) {
+      const Line J = line(memory + M_J + (NLAW + rows.first + i) * LV + column);
+      const REAL of_w = memory[M_FALLS + rows.first + i], along = memory[M_TURNS + rows.first + i];
+      UNROLL
+      for (int b = 0; b < TILE; ++b) falls[b] += of_w * J.at[b], turns[b] += along * J.at[b];
+    }
+    REAL* to = memory + M_J + (NEFC + 2 * contact) * LV + column;
+    write_line(to, falls);
+    write_line(to + LV, turns);
+  }
+}
+
 extern "C" KERNEL void minimum(const REAL* M, const REAL* J, const REAL* D, const REAL* aref,
-                               const REAL* lower, const REAL* upper, const REAL* a0, REAL* a) {
+                               const REAL* lower, const REAL* upper, const REAL* a0,
+#if C3 + C4 + C6
+                               const REAL* scale, const REAL* mu, const REAL* weight,
+#endif
+                               REAL* a) {
   const int thread = THREAD, lane = thread % 32, warp = thread / 32;
   const long state = BLOCK;
   REAL *memory = MEMORY, *A = memory + M_A, *rest = memory + M_REST, *Y = memory + M_Y;
@@ -89,10 +240,15 @@ extern "C" KERNEL void minimum(const REAL* M, const REAL* J, const REAL* D, cons
   copy_matrix<NV, NV, LV>(memory + M_M, M + state * NV * NV, thread);
   copy_matrix<NEFC, NV, LV>(memory + M_J, J + state * NEFC * NV, thread);
   copy_vector<NV>(direction, a0 + state * NV, thread);
-  copy_vector<NEFC>(memory + M_D, D + state * NEFC, thread);
-  copy_vector<NEFC>(memory + M_LOWER, lower + state * NEFC, thread);
-  copy_vector<NEFC>(memory + M_UPPER, upper + state * NEFC, thread);
+  copy_vector<NLAW>(memory + M_D, D + state * NLAW, thread);
+  copy_vector<NLAW>(memory + M_LOWER, lower + state * NLAW, thread);
+  copy_vector<NLAW>(memory + M_UPPER, upper + state * NLAW, thread);
   copy_vector<NEFC>(Y, aref + state * NEFC, thread);
+#if C3 + C4 + C6
+  copy_vector<NCONE>(memory + M_SCALE, scale + state * NCONE, thread);
+  copy_vector<CONTACTS>(memory + M_MU, mu + state * CONTACTS, thread);
+  copy_vector<CONTACTS>(memory + M_WEIGHT, weight + state * CONTACTS, thread);
+#endif
   commit();
   const Places<EACH> places(BV, thread);
   for (int i = NV + thread; i < PV; i += THREADS) memory[M_M + i * LV + i] = 1;
@@ -105,10 +261,10 @@ extern "C" KERNEL void minimum(const REAL* M, const REAL* J, const REAL* D, cons
   for (int count = 0; count < ITERATIONS; ++count) {
     int acting = 0;  // every warp counts, the first one writes
     ROLLED
-    for (int first = 0; first < NEFC; first += 32) {
+    for (int first = 0; first < NLAW; first += 32) {
       const int k = first + lane;
       REAL push = 0, bend = 0;
-      if (k < NEFC) {
+      if (k < NLAW) {
         const REAL y = Y[k], at = clipped(y, memory[M_LOWER + k], memory[M_UPPER + k]);
         push = -memory[M_D + k] * at;
         bend = at == y ? memory[M_D + k] : REAL(0);
@@ -123,7 +279,12 @@ extern "C" KERNEL void minimum(const REAL* M, const REAL* J, const REAL* D, cons
       }
       acting += ones(all);
     }
+    acting = add_cones(memory, active, acting, warp, lane);
     sync();
+    if (CONTACTS) {
+      combine_rows(memory, thread);
+      sync();
+    }
 
     Tile e[EACH];
     EACH_TILE(COUNT) {
@@ -180,8 +341,8 @@ extern "C" KERNEL void minimum(const REAL* M, const REAL* J, const REAL* D, cons
     const REAL size = REAL(1) / (1 << exponent);
     Change by_size = {0, 0};
     ROLLED
-    for (int k = thread / SIZES; k < NEFC; k += THREADS / SIZES) {
-      const Change each = change(memory, k, size);
+    for (int k = thread / SIZES; k < NLAW + CONTACTS; k += THREADS / SIZES) {
+      const Change each = change_of(memory, k, size);
       by_size.value += each.value, by_size.slope += each.slope;
     }
     UNROLL
@@ -211,7 +372,7 @@ extern "C" KERNEL void minimum(const REAL* M, const REAL* J, const REAL* D, cons
     const bool bracketed = at_far > at_near && far < 2;
     const REAL flat = bracketed ? near - at_near / (at_far - at_near) * (far - near) : REAL(1);
     REAL between = 0;
-    for (int k = lane; k < NEFC; k += 32) between += change(memory, k, flat).value;
+    for (int k = lane; k < NLAW + CONTACTS; k += 32) between += change_of(memory, k, flat).value;
     between = flat * (REAL(0.5) * flat * second - first) + sum_of(between);
     REAL least = least_of(value, SIZES);
     REAL chosen = most_of(value == least ? size : REAL(0), SIZES);

@@ -1,4 +1,4 @@
-"""`constraint_solver` on NVIDIA GPUs, without cones: a block of threads for each state.
+"""`constraint_solver` on NVIDIA GPUs: a block of threads for each state.
 
 One kernel, `constraints.cu`, makes all iterations of a state. Its matrices are in shared memory,
 or, while the Hessian is eliminated, in registers, a tile in each thread.
@@ -27,21 +27,33 @@ DIGITS = 32.0
 """A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
 
-def serves(rows: int, nv: int, itemsize: int) -> bool:
+Dims = tuple[int, ...]
+"""How many contacts have elliptic cones of 3, of 4 and of 6 rows, three numbers."""
+
+
+def serves(rows: int, nv: int, itemsize: int, dims: Dims = (0, 0, 0)) -> bool:
     """Whether there is such a GPU, and what J (rows, nv) needs fits its shared memory."""
     threads = threads_for(rows, nv)
     fits = tiles(nv) <= MOST_TILES * threads
-    return fits and shared_numbers(rows, nv, threads) * itemsize <= cuda.shared_memory()
+    return fits and shared_numbers(rows, nv, threads, dims) * itemsize <= cuda.shared_memory()
 
 
-def minima(arrays: Sequence[Array]) -> Array:
-    """The accelerations (states, nv), of M, J, D, aref, lower, upper and a0 of each state."""
+def minima(arrays: Sequence[Array], dims: Dims = (0, 0, 0)) -> Array:
+    """The accelerations (states, nv).
+
+    Args:
+        arrays: M, J, D, aref, lower, upper and a0 of each state, and if there are cones, scale,
+            mu and weight. J and aref end with the rows of cones, contact by contact; D, lower and
+            upper have those before alone.
+        dims: of contacts with cones, in that order.
+    """
     states, rows, nv = arrays[1].shape
     threads, itemsize = threads_for(rows, nv), arrays[0].dtype.itemsize
     macros = {
         "REAL": "float" if arrays[0].dtype == np.float32 else "double",
         "NV": nv,
-        "NEFC": rows,
+        "NLAW": arrays[2].shape[1],
+        **dict(zip(("C3", "C4", "C6"), dims, strict=True)),
         "TILE": tile(nv),
         "THREADS": threads,
         "ITERATIONS": ITERATIONS,
@@ -54,7 +66,7 @@ def minima(arrays: Sequence[Array]) -> Array:
         macros,
         blocks=states,
         warps=threads // WARP,
-        shared=shared_numbers(rows, nv, threads) * itemsize,
+        shared=shared_numbers(rows, nv, threads, dims) * itemsize,
         arrays=arrays,
         shapes=[(states, nv)],
         numbers=[],
@@ -74,10 +86,12 @@ def tiles(nv: int) -> int:
     return triangle(blocks) + blocks
 
 
-def shared_numbers(rows: int, nv: int, threads: int) -> int:
+def shared_numbers(rows: int, nv: int, threads: int, dims: Dims) -> int:
     """Numbers in shared memory: SHARED in the kernel."""
     size, blocks = tile(nv), -(-nv // tile(nv))
     along, padded = (blocks | 1) * size, blocks * size
     panels, sums = 2 * size * (blocks + 1) * size, 2 * SIZES * (threads // WARP)
-    numbers = (padded + rows) * along + panels + 6 * padded + 8 * rows + sums
-    return -(-numbers // 8) * 8
+    contacts, of_cones = sum(dims), 3 * dims[0] + 4 * dims[1] + 6 * dims[2]
+    terms, law = rows + 2 * contacts, rows - of_cones
+    numbers = (padded + terms) * along + panels + 6 * padded + 3 * law + 2 * rows + 3 * terms
+    return -(-(numbers + 3 * of_cones + 2 * contacts + sums) // 8) * 8

@@ -190,6 +190,41 @@ def test_the_kernel_of_cuda_finds_the_same_accelerations(
     assert [sizes["THREADS"] for sizes in calls] == [32 if m < 100 else 96]
 
 
+@pytest.mark.skipif(not shutil.which("g++"), reason="it needs a C++ compiler")
+@pytest.mark.parametrize(
+    ("nv", "law", "contacts", "dtype"),
+    [
+        (5, 3, (2, 1, 1), np.float64),  # one warp, small tiles
+        (18, 0, (0, 40, 0), np.float64),  # several warps, large tiles, more contacts than lanes
+        (5, 1, (0, 2, 0), np.float32),
+    ],
+)
+@pytest.mark.parametrize("iterations", [1, 20])
+def test_the_kernel_of_cuda_finds_the_same_accelerations_among_cones(
+    nv, law, contacts, dtype, iterations, tmp_path, monkeypatch
+):
+    calls = []
+    monkeypatch.setattr(constraints_cuda.cuda, "call", caller(tmp_path, calls))
+    for module in (constraints_cuda, constraint_solver):
+        monkeypatch.setattr(module, "ITERATIONS", iterations)
+    rng, counts = np.random.default_rng(4), dict(zip((3, 4, 6), contacts, strict=True))
+    with jax.enable_x64(dtype == np.float64):
+        cones = tuple(_contacts(rng, 3, d, nv, c) for d, c in reversed(counts.items()) if c)
+        given = drawn(3, nv, max(law, 1))._replace(cones=cones)
+        if not law:
+            rows = {name: getattr(given, name)[:, :0] for name in ("J", "D", "aref")}
+            given = given._replace(**rows, lower=given.lower[:, :0], upper=given.upper[:, :0])
+        given = jax.tree.map(lambda a: jnp.asarray(a, dtype), given)
+        wanted, _ = jax.jit(jax.vmap(lambda given: constraint_solver._plain(given)))(given)
+        zones = jax.vmap(lambda given, a: elliptic.place(given.cones[0], excess(given, a)[1]).zone)
+        slide = elliptic.SLIDES in np.asarray(zones(given, wanted))
+        found = constraint_solver._by_cuda(contacts, given)
+    close = 1e-9 if dtype == np.float64 else 1e-4
+    np.testing.assert_allclose(found, wanted, rtol=close, atol=close)
+    assert slide
+    assert [(sizes["C3"], sizes["C4"], sizes["C6"]) for sizes in calls] == [contacts]
+
+
 def test_which_kernel_a_gpu_takes(monkeypatch):
     monkeypatch.setattr(constraint_solver, "on_gpu", lambda: True)
     limits, contacts = drawn(), drawn_with_cones()
@@ -199,7 +234,7 @@ def test_which_kernel_a_gpu_takes(monkeypatch):
         kernel = constraint_solver._kernel_for(given)
         return "cuda" if kernel not in (None, minima) else kernel
 
-    for memory, of_each in ((227 * 1024, ["cuda", minima, "cuda"]), (0, [minima, minima, None])):
+    for memory, of_each in ((227 * 1024, ["cuda", "cuda", "cuda"]), (0, [minima, minima, None])):
         monkeypatch.setattr(constraints_cuda.cuda, "shared_memory", lambda memory=memory: memory)
         assert [taken(given) for given in (limits, contacts, in_float64)] == of_each
     monkeypatch.setattr(constraints_cuda.cuda, "shared_memory", lambda: 227 * 1024)
