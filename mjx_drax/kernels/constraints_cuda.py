@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.kernels import cuda
-from mjx_drax.kernels.riccati_cuda import WARP, tile, triangle
+from mjx_drax.kernels.cuda import WARP, tile, triangle
 
 KERNEL = Path(__file__).with_name("constraints.cu")
 

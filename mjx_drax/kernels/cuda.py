@@ -29,6 +29,20 @@ SHARED_MEMORY = {80: 163, 87: 163, 90: 227, 100: 227, 103: 227, 110: 227}
 """KiB that a block of threads may have, by compute capability; 99 on other GPUs."""
 
 
+WARP = 32
+"""Threads that run in step."""
+
+
+def tile(n: int) -> int:
+    """Rows of a tile: large ones are fewer, and leave threads idle where there are few anyway."""
+    return 2 if n <= 16 else 4
+
+
+def triangle(n: int) -> int:
+    """Entries of a lower triangle."""
+    return n * (n + 1) // 2
+
+
 def shared_memory() -> int:
     """Bytes that a block of threads may have; 0 if kernels cannot be compiled or launched here."""
     capability = _capability()

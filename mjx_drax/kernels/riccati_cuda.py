@@ -12,11 +12,10 @@ import numpy as np
 from jax import Array
 
 from mjx_drax.kernels import cuda
+from mjx_drax.kernels.cuda import WARP, tile, triangle
 from mjx_drax.kernels.riccati_threads import Given
 
 KERNEL = Path(__file__).with_name("riccati.cu")
-
-WARP = 32
 
 MAX_THREADS = 256
 """With more a chain is done a tenth sooner, and many chains a fifth later."""
@@ -61,11 +60,6 @@ def newton_steps(given: Given) -> dict[str, Array | None]:
     return {"noise_x": None, "noise_u": None, **dict(zip(of_stage, found, strict=False))}
 
 
-def tile(ndx: int) -> int:
-    """Rows of a tile: large ones are fewer, and leave threads idle where there are few anyway."""
-    return 2 if ndx <= 16 else 4
-
-
 def threads_for(ndx: int, nu: int) -> int:
     """Threads that work on a chain: one for each tile that is eliminated, as far as that goes."""
     x, u = blocks(ndx, nu)
@@ -78,11 +72,6 @@ def threads_for(ndx: int, nu: int) -> int:
 def blocks(ndx: int, nu: int) -> tuple[int, int]:
     """How many tiles x and u take."""
     return -(-ndx // tile(ndx)), -(-nu // tile(ndx))
-
-
-def triangle(n: int) -> int:
-    """Entries of a lower triangle."""
-    return n * (n + 1) // 2
 
 
 def shared_numbers(ndx: int, nu: int, soft: bool) -> int:
