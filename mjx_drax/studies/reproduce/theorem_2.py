@@ -131,10 +131,11 @@ def make(
     with jax.enable_x64(True):
         problem = tasks.load("pendulum").make()
         functions = _Functions(problem)
-        rows, optima = [], []
+        rows: list[dict[str, Any]] = []
+        optima: list[Optimum] = []
         for rho in barriers:
             tell(f"theorem-2: optimum and thresholds at ρ = {rho:g}")
-            optimum = _optimum(functions, problem, rho)
+            optimum = _optimum(functions, problem, rho, optima[-1] if optima else None)
             optima.append(optimum)
             rows.append(
                 {
@@ -236,14 +237,23 @@ class _Functions:
         return float(share)
 
 
-def _optimum(functions: _Functions, problem: Problem, rho: float) -> Optimum:
-    """The cheapest of a few solves with a barrier of weight rho, refined by Newton's method."""
-    solver = replace(DESCENT, barrier_weight=Constant(rho))
-    found = solve(problem, 4, seed=1, solver=solver, precision=64)
-    best = int(np.argmin(np.where(found.feasible, found.cost, np.inf)))
-    knots = jax.tree.map(lambda a: jnp.asarray(a[best]), found.trajectories)
-    lambda_ = np.asarray(found.multipliers.dynamics[best]).ravel()
-    z, lambda_ = _newton(functions, functions.flat(knots), lambda_, rho)
+def _optimum(
+    functions: _Functions, problem: Problem, rho: float, before: Optimum | None
+) -> Optimum:
+    """An optimum with a barrier of weight rho, refined by Newton's method.
+
+    It is near the one of the barrier before, or near the cheapest of a few solves. These do not
+    converge where the barrier is so heavy that the flow is not stable.
+    """
+    if before is None:
+        solver = replace(DESCENT, barrier_weight=Constant(rho))
+        found = solve(problem, 4, seed=1, solver=solver, precision=64)
+        best = int(np.argmin(np.where(found.feasible, found.cost, np.inf)))
+        knots = jax.tree.map(lambda a: jnp.asarray(a[best]), found.trajectories)
+        at = functions.flat(knots), np.asarray(found.multipliers.dynamics[best]).ravel()
+    else:
+        at = before.z, before.multipliers
+    z, lambda_ = _newton(functions, *at, rho)
     hessian, J = functions.hessian(z, lambda_, rho, 0.0), functions.jacobian(z)
     return Optimum(rho, z, lambda_, np.asarray(hessian), np.asarray(J))
 
