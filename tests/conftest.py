@@ -69,6 +69,18 @@ def keeps_programs(monkeypatch, tmp_path):
 def few_programs():
     """Forget compiled programs before there are too many, which ends a process in compilers."""
     yield
+    forget_programs()
+
+
+@pytest.fixture(autouse=True)
+def few_programs_of_slow_tests(request):
+    """The same after each of these, which compile many."""
+    yield
+    if request.node.get_closest_marker("slow"):
+        forget_programs()
+
+
+def forget_programs():
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 40_000:
         jax.clear_caches()
         gc.collect()
