@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from functools import cached_property, lru_cache, update_wrapper
 from inspect import Signature, signature
@@ -262,7 +262,9 @@ class compiled:
         if begin is not None:
             self.traced.trace(*arguments, **named)  # which JAX remembers
             begin()
-        return self.traced(*arguments, **named)
+        first = self.traced._cache_size() == 0
+        with kept.without_locations() if first else nullcontext():
+            return self.traced(*arguments, **named)
 
     def _program(self, every: dict[str, Any], static: dict[str, Any], now: Any) -> Any | None:
         """The program for these arguments in this context; None if JAX is to trace the function."""

@@ -172,9 +172,10 @@ DEVICE int add_cones(REAL* memory, int* active, int acting, int warp, int lane) 
     at.zone = OPEN;
     if (contact < CONTACTS) place_now(at, rows, memory, memory[M_MU + contact]);
     const bool acts = at.zone != OPEN, slides = at.zone == SLIDES;
-    const unsigned int in_3 = ballot(acts && rows.count == 3), in_4 = ballot(acts && rows.count == 4);
-    const unsigned int in_6 = ballot(acts && rows.count == 6), sliding = ballot(slides);
-    const unsigned int below = (1u << lane) - 1;
+    const unsigned int in_3 = ballot(acts && rows.count == 3);
+    const unsigned int in_4 = ballot(acts && rows.count == 4);
+    const unsigned int in_6 = ballot(acts && rows.count == 6);
+    const unsigned int sliding = ballot(slides), below = (1u << lane) - 1;
     if (acts && warp == 0) {
       const REAL mu = memory[M_MU + contact], g = memory[M_WEIGHT + contact];
       const REAL share = g / (1 + mu * mu);

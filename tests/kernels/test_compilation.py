@@ -110,6 +110,19 @@ def test_it_is_compiled_once_and_can_be_lowered():
     assert program.__name__ == "tripled"
 
 
+def test_the_call_that_compiles_leaves_lines_of_code_out():
+    told = []
+
+    def doubled(x):
+        told.append(jax.config.values[kept.LOCATIONS])
+        return 2 * x
+
+    before, used = jax.config.values[kept.LOCATIONS], compiled(doubled)
+    assert [used(1.0), used(2.0)] == [2.0, 4.0]
+    assert told == [0]
+    assert jax.config.values[kept.LOCATIONS] == before != 0
+
+
 KEEPING = """
 import jax
 import jax.numpy as jnp
