@@ -13,7 +13,8 @@ from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
-from mjx_drax.solution.violations import GOAL, TRACKING, words
+from mjx_drax.solution.violations import GOAL, TRACKING, entry_name, words
+from mjx_drax.solution.worst import of_engine
 
 OPTIMA = 5
 """So many distinct optima are printed."""
@@ -50,7 +51,7 @@ def lines(solution: Results) -> list[str]:
         found += f" (polish: {counts(solution.polished)})"
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
-    fall = _fall(solution)
+    hints = [hint for hint in (_fall(solution), _off_the_engine(solution)) if hint]
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -60,7 +61,7 @@ def lines(solution: Results) -> list[str]:
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
         f"optimality     {solution.optimality}",
-        *([f"               {fall}"] if fall and solution.certified else []),
+        *(f"               {hint}" for hint in hints if solution.certified),
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
@@ -176,6 +177,30 @@ def _fall(solution: Results) -> str:
     return endless(solution.history["cost"][0], solution.cost, converged)
 
 
+def _off_the_engine(solution: Results) -> str:
+    """What there is to say where a step of MuJoCo leaves a plan that is feasible by JAX's f."""
+    best = solution.best_chain
+    if mjx_dynamics(solution.problem.dynamics) is None or not solution.feasible[best]:
+        return ""
+    broken = [v for v in of_engine(solution, best) if v.broken]
+    if not broken:
+        return ""
+    kind, size, allowed, entry, knot = max(broken, key=lambda v: v.ratio)
+    return (
+        f"of f as JAX has it: at knot {knot}, {solution.times[knot]:.3g} s, a step of MuJoCo ends "
+        f"{size:.1e} off in {entry_name(solution.problem, kind, entry)} ({allowed:.1e} tolerated)."
+        f"{_stops(solution)}"
+    )
+
+
+def _stops(solution: Results) -> str:
+    """What to try where joints have stops that the plan knows nothing of."""
+    model = mjx_dynamics(solution.problem.dynamics)
+    if model is None or len(model.stops) >= model.mj_model.jnt_limited.sum():
+        return ""
+    return " With stops=True, joints may lean on their stops."
+
+
 def endless(initial: np.ndarray, cost: np.ndarray, converged: bool) -> str:
     """What there is to say where the cost seems to have no lower bound; else nothing.
 
@@ -259,9 +284,7 @@ def _advice(solution: Results) -> str:
     costs = solution.cost[solution.feasible]
     alike = int(np.isclose(costs, np.median(costs), rtol=ALIKE).sum())
     model = mjx_dynamics(solution.problem.dynamics)
-    stops = ""
-    if model is not None and model.kinked and len(model.stops) < model.mj_model.jnt_limited.sum():
-        stops = " With stops=True, joints may lean on their stops."
+    stops = _stops(solution) if model is not None and model.kinked else ""
     if broken <= {GOAL} and len(costs) > 2 and alike > len(costs) / 2:
         return (
             f"feasible chains miss the goal, {alike} of {len(costs)} at the same cost, so more "

@@ -30,9 +30,7 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
     `defect_unit` of a state, and 1e-3 of a constraint, in its unit.
     """
     problem, plan, u, extent = _motion(solution, chain)
-    off = problem.engine_defects(plan, u)
-    allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.defect_unit(plan)), off.shape)
-    found = list(worst_knots(DYNAMICS, off, allowed, 0))
+    found = of_engine(solution, chain)
     none = np.zeros(problem.dynamics.ndx)
     for violation in by_entry(problem, (plan, u), none, extent, Tolerances()):
         if "equality" in violation.kind:
@@ -40,6 +38,14 @@ def of_plan(solution: Results, chain: int) -> list[Violation]:
         if violation.kind != TRACKING:
             found.append(violation)
     return _sorted(found)
+
+
+def of_engine(solution: Results, chain: int) -> list[Violation]:
+    """Violations of the dynamics by a chain's plan, as the engine that replays it has them."""
+    problem, plan, u, _ = _motion(solution, chain)
+    off = problem.engine_defects(plan, u)
+    allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.defect_unit(plan)), off.shape)
+    return list(worst_knots(DYNAMICS, off, allowed, 0))
 
 
 def of_replay(solution: Results, chain: int) -> list[Violation]:

@@ -8,9 +8,10 @@ import pytest
 from builders import BALL, arm, made_up, point, robot
 
 from mjx_drax import DraxError, Restarts, Solution, from_program, minimize, solve_batch
+from mjx_drax.solution import report
 from mjx_drax.solution.names import difference_names
 from mjx_drax.solution.report import lines
-from mjx_drax.solution.violations import GOAL, KINDS
+from mjx_drax.solution.violations import DYNAMICS, GOAL, KINDS, Violation
 
 ONCE = Restarts(descent=5, attempts=1)
 
@@ -63,6 +64,18 @@ def test_a_cost_without_a_lower_bound_is_told():
         assert ("the cost fell from about 30 to -1e+08, as if it had no" in str(found)) == told
     diverged = replace(found, cost=np.full(2, -np.inf), max_defect=np.ones(2, np.float32))
     assert "to -inf, as if it had no lower bound" in str(diverged).splitlines()[-1]
+
+
+def test_a_step_of_the_engine_that_leaves_a_certified_plan_is_told(monkeypatch):
+    solution = made_up(robot())
+    for size, told in ((0.08, True), (0.0008, False)):
+        found = [Violation(DYNAMICS, 0.0, 1e-3, 0, 1), Violation(DYNAMICS, size, 1e-3, 1, 3)]
+        monkeypatch.setattr(report, "of_engine", lambda *of, found=found: found)
+        said = f"at knot 3, {solution.times[3]:.3g} s, a step of MuJoCo ends 8.0e-02 off in"
+        assert (said in str(solution)) == told
+        assert ("(1.0e-03 tolerated)." in str(solution)) == told
+    lost = replace(solution, max_defect=np.ones(2, np.float32))
+    assert "a step of MuJoCo" not in str(lost)
 
 
 def test_where_all_chains_diverged_more_iterations_are_no_advice():
