@@ -256,8 +256,8 @@ def _kernel_for(given: Constraints) -> Callable[[Constraints], Array] | None:
     nv, dims = given.J.shape[-1], {cones.aref.shape[1]: cones for cones in given.cones}
     if dims.keys() <= set(DIMS):
         count = tuple(dims[d].aref.shape[2] if d in dims else 0 for d in DIMS)
-        rows = given.J.shape[1] + sum(map(operator.mul, DIMS, count))
-        if constraints_cuda.serves(max(rows, 1), nv, given.J.dtype.itemsize, count):
+        rows = max(given.J.shape[1], 1) + sum(map(operator.mul, DIMS, count))
+        if constraints_cuda.serves(rows, nv, given.J.dtype.itemsize, count):
             return partial(_by_cuda, count)
     most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
     most = min(most, MOST_WITH_CONES) if given.cones else most
