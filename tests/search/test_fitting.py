@@ -123,7 +123,12 @@ def test_a_box_that_is_left_far_behind_becomes_twice_as_wide_as_the_motion():
     assert widened(tasks.load("hopper_jump").make(), np.full((11, 11), 1e6), u) is None
 
 
-@pytest.mark.parametrize("far", [1e5, 1e-2, 1e-4, 1e-6])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "far", [1e5, pytest.param(1e-2, marks=SLOW), pytest.param(1e-4, marks=SLOW), 1e-6]
+)
 def test_motions_that_do_not_fit_the_default_box_are_found(far):
     problem = runs(
         np.inf,
