@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
@@ -18,6 +17,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from mjx_drax.base.errors import DraxError, reason
+from mjx_drax.base.meanwhile import Meanwhile
 from mjx_drax.kernels import kept
 from mjx_drax.kernels.batching import on_gpu
 
@@ -48,29 +48,17 @@ _config: Any = jax.config
 """Its attributes say what holds in a context, too; `values` only what was set for the process."""
 
 
-_RARELY = threading.Lock()
-_rarely: list[tuple[int, int, int]] = []
-"""What the threshold was, once for each that is in `rarely_collected`."""
+def _collect_rarely() -> tuple[int, int, int]:
+    before = gc.get_threshold()
+    gc.set_threshold(100 * before[0], *before[1:])
+    return before
 
 
-@contextmanager
-def rarely_collected() -> Iterator[None]:
-    """Let Python look for garbage a hundred times less often, also as a decorator.
+rarely_collected = Meanwhile(_collect_rarely, lambda before: gc.set_threshold(*before))
+"""Inside of this Python looks for garbage a hundred times less often.
 
-    While JAX traces, hardly any of its objects are garbage: to look for it took a fifth of the time
-    until a quadruped's first iteration.
-    """
-    with _RARELY:
-        _rarely.append(_rarely[0] if _rarely else gc.get_threshold())
-        first, *rest = _rarely[0]
-        gc.set_threshold(100 * first, *rest)
-    try:
-        yield
-    finally:
-        with _RARELY:
-            before = _rarely.pop()
-            if not _rarely:  # the last one, of all threads
-                gc.set_threshold(*before)
+While JAX traces, hardly any of its objects are garbage: to look for it took a fifth of the time
+until a quadruped's first iteration."""
 
 
 @rarely_collected()

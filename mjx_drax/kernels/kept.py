@@ -11,12 +11,10 @@ import os
 import pickle
 import platform
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from functools import lru_cache
+from contextlib import suppress
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import jax
@@ -27,6 +25,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from mjx_drax.base.digests import DIGEST, digest, versions
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete
+from mjx_drax.base.meanwhile import Meanwhile
 
 ENABLED, FOLDER = "jax_enable_compilation_cache", "jax_compilation_cache_dir"
 """JAX's settings of its own cache, which also say whether programs are kept here, and where."""
@@ -35,9 +34,6 @@ LOCATIONS = "jax_traceback_in_locations_limit"
 """JAX's setting of how many lines of code a program tells of each of its operations."""
 
 _LOADED = time.time()
-_lock, _compiling = Lock(), [0]
-_told: list[int] = []
-"""How many lines were told, once for each that is in `without_locations`."""
 
 
 class CannotBeKept(Exception):
@@ -50,7 +46,7 @@ def folder() -> Path | None:
     Also while another thread has something `unknown_to_jax`.
     """
     known = jax.config.values
-    enabled = known[ENABLED] or _compiling[0] > 0
+    enabled = known[ENABLED] or unknown_to_jax.lasts
     if not (enabled and known[FOLDER]) or "://" in known[FOLDER]:
         return None
     return Path(known[FOLDER]) / "programs"
@@ -125,47 +121,28 @@ def keep(key: str, program: Any) -> None:
     remember(key, (result, content))
 
 
-@contextmanager
-def unknown_to_jax() -> Iterator[None]:
-    """Compile what is not kept twice, and is compiled anew.
-
-    On CPUs an executable from JAX's cache does not hold all that another process needs of it.
-    Threads that compile meanwhile do without that cache, too.
-    """
-    with _lock:
-        _compiling[0] += 1
-        if _compiling[0] == 1:
-            _use_cache(False)
-    try:
-        yield
-    finally:
-        with _lock:
-            _compiling[0] -= 1
-            if _compiling[0] == 0:
-                _use_cache(True)
-
-
-@contextmanager
-def without_locations() -> Iterator[None]:
-    """Lower programs that do not tell which lines of code their operations come from.
-
-    XLA reads that anew with each program that it loads, which takes longer than the rest.
-    """
-    with _lock:
-        _told.append(_told[0] if _told else jax.config.values[LOCATIONS])
-        jax.config.update(LOCATIONS, 0)
-    try:
-        yield
-    finally:
-        with _lock:
-            before = _told.pop()
-            if not _told:  # the last one, of all threads
-                jax.config.update(LOCATIONS, before)
-
-
 def _use_cache(used: bool) -> None:
     jax.config.update(ENABLED, used)
     compilation_cache.reset_cache()  # it asks once whether it is used
+
+
+unknown_to_jax = Meanwhile(lambda: _use_cache(False), lambda _: _use_cache(True))
+"""Inside of this what is compiled is not kept twice, and is compiled anew.
+
+On CPUs an executable from JAX's cache does not hold all that another process needs of it. Threads
+that compile meanwhile do without that cache, too."""
+
+
+def _leave_out_locations() -> Any:
+    before = jax.config.values[LOCATIONS]
+    jax.config.update(LOCATIONS, 0)
+    return before
+
+
+without_locations = Meanwhile(_leave_out_locations, partial(jax.config.update, LOCATIONS))
+"""Programs that are lowered inside of this do not tell which lines of code they come from.
+
+XLA reads that anew with each program that it loads, which takes longer than the rest."""
 
 
 def _place(key: str) -> Path | None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mjx_drax.base.meanwhile import Meanwhile
 from mjx_drax.physics.contacts.pairs import Contacts, Pair, left_out
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
@@ -28,30 +29,16 @@ STOPPED = 10.0
 base that is held by a damping of 1e11 would be pushed with as many newtons."""
 
 
-class _Quiet:
-    """What keeps MuJoCo quiet; MuJoCo has one handler for all threads."""
-
-    def __init__(self) -> None:
-        self._lock, self._inside, self._handler = threading.Lock(), 0, None
-
-    @contextlib.contextmanager
-    def __call__(self) -> Iterator[None]:
-        """Keep MuJoCo from printing warnings, and from writing MUJOCO_LOG.TXT into the folder."""
-        with self._lock:
-            if not self._inside:
-                self._handler = mujoco.get_mju_user_warning()
-                mujoco.set_mju_user_warning(lambda message: None)
-            self._inside += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._inside -= 1
-                if not self._inside:
-                    mujoco.set_mju_user_warning(self._handler)
+def _hush() -> Any:
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    return before
 
 
-quiet = _Quiet()
+quiet = Meanwhile(_hush, mujoco.set_mju_user_warning)
+"""Inside of this MuJoCo prints no warnings, and writes no MUJOCO_LOG.TXT into the folder.
+
+It has one handler for all threads."""
 
 
 def finite(states: Floats) -> Floats:
