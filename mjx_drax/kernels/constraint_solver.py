@@ -8,7 +8,7 @@ where s_i'(y) is D y, clipped where a contact or a limit opens, y > 0, or where 
 `elliptic_cones` has the s of elliptic friction cones. Without these the function is piecewise
 quadratic: once the constraints that are active stay the same, a full step ends at the minimum;
 before, a shorter one may be better. On GPUs one kernel does all iterations of a row, in a block of
-threads: that of `constraints_cuda`, or where that is not served, in float32, that of `minima`.
+threads: that of `constraints_cuda`, or, where it serves none, in float32, that of `minima`.
 
 Forces may be larger than what they leave over by more digits than numbers have. So only changes of
 the function are computed, and M a0, which is the sum of all other forces, is never taken from M a.
@@ -17,7 +17,6 @@ the function are computed, and M a0, which is the sum of all other forces, is ne
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -36,7 +35,7 @@ from mjx_drax.kernels.batching import (
     on_gpu,
     repeated,
 )
-from mjx_drax.kernels.constraints_cuda import DIGITS, ITERATIONS, SIZES
+from mjx_drax.kernels.constraints_cuda import DIGITS, DIMS, ITERATIONS, SIZES, rows_of_cones
 from mjx_drax.kernels.linalg import solve_positive, symmetric
 from mjx_drax.kernels.tiles import LEAST, padded, products, swept, tile, times, transposed_times
 
@@ -46,9 +45,6 @@ MOST_ROWS, MOST_WITH_CONES = ((32, 512), (64, 128)), 128
 Beyond, arrays are used: nobody has measured the kernel there.
 On an H100, 275 rows of a hand's contacts, in 1,600 states, take 26 ms in the kernel and 70 ms as
 arrays; 72 rows of Spot's elliptic cones, in 8,960 states, 5.6 and 21 ms."""
-
-DIMS = 3, 4, 6
-"""Rows that contacts with friction have."""
 
 MOST_OF_ONE_WARP = 64
 """Rows of J, in tiles, up to which one warp of 32 threads works on a state: none waits for others.
@@ -253,18 +249,19 @@ def _kernel_for(given: Constraints) -> Callable[[Constraints], Array] | None:
     """What finds the accelerations of all rows on this GPU; None: arrays do."""
     if not (on_gpu() and of_one_precision(jax.tree.leaves(given))):
         return None
-    nv, dims = given.J.shape[-1], {cones.aref.shape[1]: cones for cones in given.cones}
-    if dims.keys() <= set(DIMS):
-        count = tuple(dims[d].aref.shape[2] if d in dims else 0 for d in DIMS)
-        rows = max(given.J.shape[1], 1) + sum(map(operator.mul, DIMS, count))
-        if constraints_cuda.serves(rows, nv, given.J.dtype.itemsize, count):
-            return partial(_by_cuda, count)
+    nv = given.J.shape[-1]
+    by_dim = {cones.aref.shape[1]: cones.aref.shape[2] for cones in given.cones}
+    if by_dim.keys() <= set(DIMS):
+        contacts = tuple(by_dim.get(dim, 0) for dim in DIMS)
+        rows = max(given.J.shape[1], 1) + rows_of_cones(contacts)
+        if constraints_cuda.serves(rows, nv, given.J.dtype.itemsize, contacts):
+            return partial(_by_cuda, contacts)
     most = max((m for columns, m in MOST_ROWS if nv <= columns), default=0)
     most = min(most, MOST_WITH_CONES) if given.cones else most
     return minima if _rows(given) <= most and given.M.dtype == np.float32 else None
 
 
-def _by_cuda(dims: constraints_cuda.Dims, given: Constraints) -> Array:
+def _by_cuda(contacts: constraints_cuda.Counts, given: Constraints) -> Array:
     """The accelerations (rows, nv) by `constraints_cuda`."""
     if not given.D.shape[1]:  # it wants a row without a cone; this one does nothing
         none = jnp.zeros_like(given.a0[:, :1])
@@ -283,7 +280,7 @@ def _by_cuda(dims: constraints_cuda.Dims, given: Constraints) -> Array:
     aref = jnp.concatenate([given.aref, by_contact([c.aref for c in cones])], axis=1)
     more = [by_contact([c.scale for c in cones])]
     more += [jnp.concatenate(a, axis=1) for a in ([c.mu for c in cones], [c.weight for c in cones])]
-    return constraints_cuda.minima([*given._replace(J=J, aref=aref)[:-1], *more], dims)
+    return constraints_cuda.minima([*given._replace(J=J, aref=aref)[:-1], *more], contacts)
 
 
 def minima(given: Constraints, interpret: bool = False) -> Array:

@@ -6,6 +6,7 @@ or, while the Hessian is eliminated, in registers, a tile in each thread.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,25 +28,30 @@ DIGITS = 32.0
 """A step shorter, measured by M, than so many roundings of all that came before is the last."""
 
 
-Dims = tuple[int, ...]
-"""How many contacts have elliptic cones of 3, of 4 and of 6 rows, three numbers."""
+DIMS = 3, 4, 6
+"""Rows that contacts with elliptic cones have."""
+
+NO_CONES = 0, 0, 0
+
+Counts = tuple[int, ...]
+"""How many contacts there are with each of `DIMS`."""
 
 
-def serves(rows: int, nv: int, itemsize: int, dims: Dims = (0, 0, 0)) -> bool:
+def serves(rows: int, nv: int, itemsize: int, contacts: Counts = NO_CONES) -> bool:
     """Whether there is such a GPU, and what J (rows, nv) needs fits its shared memory."""
     threads = threads_for(rows, nv)
     fits = tiles(nv) <= MOST_TILES * threads
-    return fits and shared_numbers(rows, nv, threads, dims) * itemsize <= cuda.shared_memory()
+    return fits and shared_numbers(rows, nv, threads, contacts) * itemsize <= cuda.shared_memory()
 
 
-def minima(arrays: Sequence[Array], dims: Dims = (0, 0, 0)) -> Array:
+def minima(arrays: Sequence[Array], contacts: Counts = NO_CONES) -> Array:
     """The accelerations (states, nv).
 
     Args:
         arrays: M, J, D, aref, lower, upper and a0 of each state, and if there are cones, scale,
             mu and weight. J and aref end with the rows of cones, contact by contact; D, lower and
             upper have those before alone.
-        dims: of contacts with cones, in that order.
+        contacts: those with cones, in the order of `DIMS`.
     """
     states, rows, nv = arrays[1].shape
     threads, itemsize = threads_for(rows, nv), arrays[0].dtype.itemsize
@@ -53,7 +59,7 @@ def minima(arrays: Sequence[Array], dims: Dims = (0, 0, 0)) -> Array:
         "REAL": "float" if arrays[0].dtype == np.float32 else "double",
         "NV": nv,
         "NLAW": arrays[2].shape[1],
-        **dict(zip(("C3", "C4", "C6"), dims, strict=True)),
+        **{f"C{dim}": count for dim, count in zip(DIMS, contacts, strict=True)},
         "TILE": tile(nv),
         "THREADS": threads,
         "ITERATIONS": ITERATIONS,
@@ -66,12 +72,17 @@ def minima(arrays: Sequence[Array], dims: Dims = (0, 0, 0)) -> Array:
         macros,
         blocks=states,
         warps=threads // WARP,
-        shared=shared_numbers(rows, nv, threads, dims) * itemsize,
+        shared=shared_numbers(rows, nv, threads, contacts) * itemsize,
         arrays=arrays,
         shapes=[(states, nv)],
         numbers=[],
     )
     return found
+
+
+def rows_of_cones(contacts: Counts) -> int:
+    """Rows of J that contacts with cones have."""
+    return sum(map(operator.mul, DIMS, contacts))
 
 
 def threads_for(rows: int, nv: int) -> int:
@@ -86,12 +97,12 @@ def tiles(nv: int) -> int:
     return triangle(blocks) + blocks
 
 
-def shared_numbers(rows: int, nv: int, threads: int, dims: Dims) -> int:
+def shared_numbers(rows: int, nv: int, threads: int, contacts: Counts) -> int:
     """Numbers in shared memory: SHARED in the kernel."""
     size, blocks = tile(nv), -(-nv // tile(nv))
     along, padded = (blocks | 1) * size, blocks * size
     panels, sums = 2 * size * (blocks + 1) * size, 2 * SIZES * (threads // WARP)
-    contacts, of_cones = sum(dims), 3 * dims[0] + 4 * dims[1] + 6 * dims[2]
-    terms, law = rows + 2 * contacts, rows - of_cones
+    of_cones = rows_of_cones(contacts)
+    terms, law = rows + 2 * sum(contacts), rows - of_cones
     numbers = (padded + terms) * along + panels + 6 * padded + 3 * law + 2 * rows + 3 * terms
-    return -(-(numbers + 3 * of_cones + 2 * contacts + sums) // 8) * 8
+    return -(-(numbers + 3 * of_cones + 2 * sum(contacts) + sums) // 8) * 8

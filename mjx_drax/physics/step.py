@@ -58,7 +58,7 @@ from mjx_drax.physics.tree import (
 )
 
 MANY = 6
-"""Contacts from which on their Jacobian is not differentiated. Jacobians of f then take 93 to 50 %
+"""Contacts from which on their Jacobian is not differentiated. Jacobians of f then take 92 to 50 %
 of the time on an H200 (6 and 28 contacts), 105 to 54 % on CPUs; with 4 on CPUs it was 126 %."""
 
 RK4 = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))

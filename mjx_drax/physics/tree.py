@@ -11,7 +11,7 @@ Velocities, accelerations, forces and inertias add up along the tree. With S[b, 
 of freedom d moves body b, and 0 elsewhere, sums over all that is above a body are products with S,
 and sums over all that is below it are products with S'.
 
-Products of small matrices are written as sums of three terms, because compilers fuse sums, but
+Products of small matrices are written as sums of few terms, because compilers fuse sums, but
 neither reductions nor calls of a library.
 """
 
@@ -19,6 +19,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
@@ -76,33 +78,33 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         tilt = tilt.at[mocap].set(normalized(data.mocap_quat[which]))
     slides, turns = _slides(model, data.qpos), _turns(model, data.qpos)
     pivots = jnp.where(kinds[:, None] == FREE, 0.0, model.jnt_pos)
-    move = _padded(slides + pivots - _applied(turns, pivots), 0.0)[frames.joints]
+    move = _padded(slides + pivots - applied(turns, pivots), 0.0)[frames.joints]
     turn = _padded(turns, jnp.eye(3))[frames.joints]
     offsets = _padded(offset, 0.0)[frames.bodies]
     tilts = _padded(matrix(tilt), jnp.eye(3))[frames.bodies]
-    pos, mat = offsets + _applied(tilts, move), _product(tilts, turn)
+    pos, mat = offsets + applied(tilts, move), _product(tilts, turn)
     pos, mat = _composed(pos, mat, frames.parents)
 
     after = np.array([np.flatnonzero(frames.joints == j)[0] for j in range(model.njnt)], int)
     axes = model.jnt_axis
     if (kinds == BALL).any():  # MuJoCo's axis is that before the joint turns; only balls turn it
-        before = _applied(jnp.swapaxes(turns, 1, 2), axes)
+        before = applied(jnp.swapaxes(turns, 1, 2), axes)
         axes = jnp.where(kinds[:, None] == BALL, before, axes)
-    xaxis = _applied(mat[after], axes)
+    xaxis = applied(mat[after], axes)
     xaxis = jnp.where(kinds[:, None] == FREE, jnp.array([0.0, 0.0, 1.0]), xaxis)
     slid = jnp.where(kinds[:, None] == SLIDE, slides, 0.0)
     xpos, xmat = pos[frames.last], mat[frames.last]
 
     def placed(body: np.ndarray, pos: Array, quat: Array) -> tuple[Array, Array]:
         """Positions and axes of what is fixed to bodies."""
-        return xpos[body] + _applied(xmat[body], pos), _product(xmat[body], matrix(quat))
+        return xpos[body] + applied(xmat[body], pos), _product(xmat[body], matrix(quat))
 
     xipos, ximat = placed(np.arange(model.nbody), model.body_ipos, model.body_iquat)
     geom_xpos, geom_xmat = placed(np.asarray(model.geom_bodyid), model.geom_pos, model.geom_quat)
     site_xpos, site_xmat = placed(np.asarray(model.site_bodyid), model.site_pos, model.site_quat)
     return data.replace(
         qpos=Joints.of(model).normalized(data.qpos),
-        xanchor=pos[after] + _applied(mat[after], pivots - slid),
+        xanchor=pos[after] + applied(mat[after], pivots - slid),
         xaxis=xaxis,
         xpos=xpos,
         xquat=_quaternions(model, data.qpos, tilt, frames),
@@ -274,12 +276,12 @@ def inverse_derivatives(
     twist, push = below[:, 19:22], below[:, 22:]
     turning, moving = jnp.split(S, 2, axis=1)
     moved = _inertia_times(inertias, S)
-    swept = _applied(Z, turning) - jnp.cross(turning, twist) - 2.0 * jnp.cross(moving, push)
+    swept = applied(Z, turning) - jnp.cross(turning, twist) - 2.0 * jnp.cross(moving, push)
 
     def derivative(first: Array, second: Array, force: Array) -> Array:
         """s_i . (B s_j' + I s_j'') for such columns (nv, 6), and forces of bodies (nbody, 6)."""
         turns = first[:, :3]
-        around = _applied(Z, turns) - jnp.cross(twist, turns)
+        around = applied(Z, turns) - jnp.cross(twist, turns)
         own = jnp.concatenate([around, -2.0 * jnp.cross(push, turns)], axis=1)
         own = own + _inertia_times(inertias, second) + _crossed_force(S, _summed(moves.T, force))
         by_above = jnp.sum(swept[:, None] * turns, axis=2)
@@ -353,7 +355,7 @@ def _inertia_times(inertia: Array, motion: Array) -> Array:
     """Momenta (n, 6) of bodies with inertias (n, 10) in motions (n, 6)."""
     whole, off, mass = _tensors(inertia), inertia[:, 6:9], inertia[:, 9:]
     turning, moving = motion[:, :3], motion[:, 3:]
-    angular = _applied(whole, turning) + jnp.cross(off, moving)
+    angular = applied(whole, turning) + jnp.cross(off, moving)
     return jnp.concatenate([angular, mass * moving - jnp.cross(off, turning)], axis=1)
 
 
@@ -443,15 +445,14 @@ def _composed(pos: Array, mat: Array, parents: np.ndarray) -> tuple[Array, Array
     """Frames (n, 3) and (n, 3, 3) in the world, from those in their parents (n,)."""
     while parents.any():
         above = mat[parents]
-        pos, mat = pos[parents] + _applied(above, pos), _product(above, mat)
+        pos, mat = pos[parents] + applied(above, pos), _product(above, mat)
         parents = parents[parents]
     return pos, mat
 
 
-def _applied(A: Array, v: Array) -> Array:
-    """A v for matrices (n, 3, 3) and vectors (n, 3)."""
-    x, y, z = (A[:, :, k] * v[:, k, None] for k in range(3))
-    return x + y + z
+def applied(A: Array, v: Array) -> Array:
+    """A v for matrices (n, i, j) and vectors (n, j)."""
+    return reduce(add, [A[:, :, k] * v[:, k, None] for k in range(v.shape[1])])
 
 
 def _product(A: Array, B: Array) -> Array:

@@ -224,8 +224,8 @@ def collision(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return with_internal(data, contact=contact.replace(includemargin=margin))
 
 
-def touching(model: mjx.Model) -> np.ndarray:
-    """Numbers of the bodies that contacts of the model may push."""
+def bodies_in_contact(model: mjx.Model) -> np.ndarray:
+    """Numbers of the bodies (n,) that contacts of the model may push."""
     with extended():
         pairs = [pair[:2] for pair in collision_driver.geom_pairs(model)]
     return np.unique(np.asarray(model.geom_bodyid)[np.array(pairs, int).reshape(-1)])

@@ -8,8 +8,7 @@ and took half of the time of all Jacobians of a humanoid robot.
 
 from __future__ import annotations
 
-from functools import partial, reduce
-from operator import add
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,9 +18,9 @@ from jax import Array
 
 from mjx_drax.kernels import elliptic_cones as elliptic
 from mjx_drax.physics._mjx import constraint, internal, mjx
-from mjx_drax.physics.contacts.collision import touching
+from mjx_drax.physics.contacts.collision import bodies_in_contact
 from mjx_drax.physics.engine import mujoco
-from mjx_drax.physics.tree import joint_forces, motions
+from mjx_drax.physics.tree import applied, joint_forces, motions
 
 
 def contact_forces(model: mjx.Model, data: mjx.Data, qacc: Array) -> Array:
@@ -32,7 +31,7 @@ def contact_forces(model: mjx.Model, data: mjx.Data, qacc: Array) -> Array:
         data: it has contacts, motions about centres of mass, and velocities.
         qacc: the acceleration.
     """
-    bodies = touching(model)
+    bodies = bodies_in_contact(model)
     wrenches = jnp.zeros((len(bodies), 6), qacc.dtype)
     for dim in np.unique(internal(data).contact.dim):
         wrenches = wrenches + _wrenches(model, data, qacc, bodies, int(dim))
@@ -67,8 +66,8 @@ def _wrenches(model: mjx.Model, data: mjx.Data, qacc: Array, every: np.ndarray, 
         of_both = motions(model, data, velocity, every)[jnp.argmax(is_body, axis=2)]
         turning, moving = jnp.split(of_both, 2, axis=2)
         moving = moving + jnp.cross(turning, arms)
-        seen = [_times(frame, each[:, 1] - each[:, 0]) for each in (moving, turning)]
-        return touches * _times(edges, jnp.concatenate(seen, axis=1)[:, :dim])
+        seen = [applied(frame, each[:, 1] - each[:, 0]) for each in (moving, turning)]
+        return touches * applied(edges, jnp.concatenate(seen, axis=1)[:, :dim])
 
     k, b, impedance = jax.vmap(partial(constraint._kbi, model))(row.solref, row.solimp, row.pos_imp)
     softness = jnp.maximum(row.invweight * (1 - impedance) / impedance, mujoco.mjMINVAL)
@@ -81,9 +80,9 @@ def _wrenches(model: mjx.Model, data: mjx.Data, qacc: Array, every: np.ndarray, 
         push = elliptic.forces(given, elliptic.place(given, y.T)).T
     else:
         push = -D * jnp.minimum(y, 0.0)
-    along = _times(jnp.swapaxes(edges, 1, 2), touches * push)
+    along = applied(jnp.swapaxes(edges, 1, 2), touches * push)
     halves = jnp.split(jnp.pad(along, ((0, 0), (0, 6 - dim))), 2, axis=1)
-    force, torque = (_times(jnp.swapaxes(frame, 1, 2), half)[:, None] for half in halves)
+    force, torque = (applied(jnp.swapaxes(frame, 1, 2), half)[:, None] for half in halves)
     around = torque + jnp.cross(arms, force)
     wrench = jnp.concatenate([around, jnp.broadcast_to(force, arms.shape)], axis=2)
     on_both = wrench * jnp.array([-1.0, 1.0], wrench.dtype)[:, None]
@@ -108,9 +107,3 @@ def _edges(model: mjx.Model, data: mjx.Data, friction: Array, dim: int) -> tuple
     aside = tilts[..., None] * jnp.repeat(jnp.eye(dim - 1, dtype=dtype), 2, axis=0)
     edges = jnp.concatenate([jnp.ones_like(tilts)[..., None], aside], axis=2)
     return constraint._efc_contact_pyramidal(model, data, dim), edges
-
-
-def _times(A: Array, v: Array) -> Array:
-    """A v for matrices (n, i, j) and vectors (n, j), as a sum, which compilers fuse."""
-    terms: list[Array] = [A[:, :, k] * v[:, k, None] for k in range(v.shape[1])]
-    return reduce(add, terms)

@@ -12,7 +12,7 @@ from mjx_drax import from_mjcf
 from mjx_drax.kernels.compilation import run_once
 from mjx_drax.physics import step
 from mjx_drax.physics._mjx import internal
-from mjx_drax.physics.contacts.collision import touching
+from mjx_drax.physics.contacts.collision import bodies_in_contact
 from mjx_drax.physics.tree import kinematics
 
 ON_TOP = """
@@ -63,4 +63,4 @@ def test_they_and_their_derivatives_are_those_of_the_rows(cone):
     assert np.abs(slope_by_rows).max() > 100.0
     np.testing.assert_allclose(pull, by_rows, atol=1e-9 * np.abs(by_rows).max())
     np.testing.assert_allclose(slope, slope_by_rows, atol=1e-9 * np.abs(slope_by_rows).max())
-    assert touching(dynamics.model).tolist() == [0, 1, 2, 3, 4, 6]  # not the one far away
+    assert bodies_in_contact(dynamics.model).tolist() == [0, 1, 2, 3, 4, 6]  # not the one far away
