@@ -51,7 +51,7 @@ def lines(solution: Results) -> list[str]:
         found += f" (polish: {counts(solution.polished)})"
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
-    hints = [hint for hint in (_fall(solution), _off_the_engine(solution)) if hint]
+    hints = (_fall(solution), _off_the_engine(solution)) if solution.certified else ()
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -61,7 +61,7 @@ def lines(solution: Results) -> list[str]:
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
         f"optimality     {solution.optimality}",
-        *(f"               {hint}" for hint in hints if solution.certified),
+        *(f"               {hint}" for hint in hints if hint),
         *optima_lines(solution),
         f"engine         {solution.certificate.engine}",
         f"time           {times}",
@@ -178,9 +178,9 @@ def _fall(solution: Results) -> str:
 
 
 def _off_the_engine(solution: Results) -> str:
-    """What there is to say where a step of MuJoCo leaves a plan that is feasible by JAX's f."""
+    """What there is to say where a step of MuJoCo leaves a certified plan: feasible by JAX's f."""
     best = solution.best_chain
-    if mjx_dynamics(solution.problem.dynamics) is None or not solution.feasible[best]:
+    if mjx_dynamics(solution.problem.dynamics) is None:
         return ""
     broken = [v for v in of_engine(solution, best) if v.broken]
     if not broken:
