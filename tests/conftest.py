@@ -81,6 +81,7 @@ def few_programs_of_slow_tests(request):
 
 
 def forget_programs():
+    """Unless there are few."""
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > 40_000:
         jax.clear_caches()
         gc.collect()

@@ -22,7 +22,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mjx_drax import Autodiff
 from mjx_drax.kernels.compilation import compiled
@@ -34,7 +33,7 @@ from mjx_drax.polish.interior_point import Polish, begin_inside
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, iteration, start
-from mjx_drax.studies.recursion import batch
+from mjx_drax.studies.recursion import batch, median_seconds
 from mjx_drax.studies.robots import named
 
 TASKS = ("quadruped_step:32", "humanoid_stand:32", "quadruped_step:1", "humanoid_stand:1")
@@ -64,12 +63,7 @@ def times(problem: Problem, chains: int, repeats: int) -> tuple[list[float], flo
         clock = time.perf_counter()
         program = compiled(full_precision(jax.vmap(part))).lower(*arguments).compile()
         compiling += time.perf_counter() - clock
-        jax.block_until_ready(program(*arguments))
-        clocks = [time.perf_counter()]
-        for _ in range(repeats):
-            jax.block_until_ready(program(*arguments))
-            clocks.append(time.perf_counter())
-        seconds.append(float(np.median(np.diff(clocks))))
+        seconds.append(median_seconds(program, arguments, repeats)[0])
     return seconds, compiling
 
 

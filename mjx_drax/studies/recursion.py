@@ -75,12 +75,18 @@ def timed(step: Callable[..., Any], given: Any, repeats: int) -> tuple[float, Ar
 
         return first, lax.fori_loop(1, STEPS, another, first)
 
-    out, seconds = jax.block_until_ready(steps(*given)), []
+    seconds, out = median_seconds(steps, given, repeats)
+    return seconds / STEPS, out[0][0]
+
+
+def median_seconds(call: Callable[..., Any], given: Any, repeats: int) -> tuple[float, Any]:
+    """Median seconds of call(*given) after the first, and what it returned."""
+    out = jax.block_until_ready(call(*given))
+    clocks = [time.perf_counter()]
     for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(steps(*given))
-        seconds.append(time.perf_counter() - start)
-    return float(np.median(seconds)) / STEPS, out[0][0]
+        jax.block_until_ready(call(*given))
+        clocks.append(time.perf_counter())
+    return float(np.median(np.diff(clocks))), out
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
