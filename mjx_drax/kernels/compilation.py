@@ -300,6 +300,15 @@ class compiled:
         """`jax.jit(...).lower`."""
         return self.traced.lower(*arguments, **named)
 
+    def identity(self, *arguments: Any, **named: Any) -> str:
+        """A text that says what the function computes of such arguments, by its key if that knows.
+
+        The text of a traced program may differ in a process that has traced others before.
+        """
+        every = self._signature.bind(*arguments, **named).arguments
+        known = self._key(**every) if self._key is not None else None
+        return str(self.lower(*arguments, **named).as_text()) if known is None else known
+
     def _cache_size(self) -> int:
         return int(self.traced._cache_size()) + sum(p is not None for p in self._programs.values())
 

@@ -1045,8 +1045,9 @@ class Search:
             return 0.0, False
         state, tail = stage.now.state, self.settings.after > 0
         checkpoint.require({"initial knots": digest(state.trajectory)})
-        program = iterate.lower((state, self.question[1]), self.question[0], 0, 0, tail)
-        checkpoint.require({"functions": digest(program.as_text())})
+        shared, own = self.question
+        functions = iterate.identity((state, own), shared, start=0, stop=0, tail=tail)
+        checkpoint.require({"functions": digest(functions)})
         if checkpoint.found is None:
             return 0.0, False
         if self.family.alone and "stage.kept.feasible_since" in checkpoint.found:

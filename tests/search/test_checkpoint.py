@@ -290,9 +290,9 @@ def test_a_batch_that_is_killed_between_rollouts(tmp_path):
 
 
 class Unused:
-    """The loop over iterations, of which only the text is wanted."""
+    """The loop over iterations, of which it is only asked what it computes."""
 
-    lower = iterate.lower
+    identity = iterate.identity
 
     def __call__(self, *_, **__):
         pytest.fail("it iterates")
@@ -304,6 +304,8 @@ def test_what_is_complete_is_not_solved_again(whole, whole_batch, tmp_path, monk
     batch(checkpoint=many)
     written = one.stat().st_mtime_ns, many.stat().st_mtime_ns
     monkeypatch.setattr(engine, "iterate", Unused())
+    # The text of a traced program differs with what a process has traced before
+    monkeypatch.setattr(type(iterate), "lower", lambda *_, **__: pytest.fail("it is traced"))
     again = solved(checkpoint=one)
     assert_same(again, whole)
     assert again.solve_time == pytest.approx(first.solve_time, abs=0.1)
