@@ -348,23 +348,25 @@ def scatter_box(
     nx, nu = x_init.shape[0], bounds.u_lower.shape[-1]
     given = box(nx, nu, x, u)
 
-    @jax.jit
-    def ends(
-        asked: tuple[Array, Array], bound: tuple[Array, Array], middle: Array, reach: Array
-    ) -> tuple[Array, Array]:
-        low, high = (jnp.where(jnp.isfinite(a), a, b) for a, b in zip(asked, bound, strict=True))
-        # Where an end is free: next to the other one, or about the middle if both are.
-        middle = jnp.clip(middle, low + reach, high - reach)
-        return (
-            jnp.where(jnp.isfinite(low), low, middle - reach),
-            jnp.where(jnp.isfinite(high), high, middle + reach),
-        )
-
-    x_ends = ends((given.x_lower, given.x_upper), (bounds.x_lower, bounds.x_upper), x_init, reach)
-    u_ends = ends(
+    x_ends = _ends((given.x_lower, given.x_upper), (bounds.x_lower, bounds.x_upper), x_init, reach)
+    u_ends = _ends(
         (given.u_lower, given.u_upper),
         (bounds.u_lower, bounds.u_upper),
         jnp.zeros(nu),
         jnp.ones(nu),
     )
     return Box(x_ends[0], x_ends[1], u_ends[0], u_ends[1])
+
+
+@jax.jit
+def _ends(
+    asked: tuple[Array, Array], bound: tuple[Array, Array], middle: Array, reach: Array
+) -> tuple[Array, Array]:
+    """Lower and upper ends of `scatter_box`, for states or for controls."""
+    low, high = (jnp.where(jnp.isfinite(a), a, b) for a, b in zip(asked, bound, strict=True))
+    # Where an end is free: next to the other one, or about the middle if both are.
+    middle = jnp.clip(middle, low + reach, high - reach)
+    return (
+        jnp.where(jnp.isfinite(low), low, middle - reach),
+        jnp.where(jnp.isfinite(high), high, middle + reach),
+    )
