@@ -313,7 +313,7 @@ def assert_touch_alike(model, found, wanted, atol):
     acting = np.asarray(found.dist) < model.geom_margin.sum()
     one, other = (np.lexsort(p.round(6).T) for p in (found.pos[acting], wanted.pos))
     for name in ("dist", "pos", "frame"):
-        here, there = (getattr(c, name) for c in (found, wanted))
+        here, there = (np.asarray(getattr(c, name)) for c in (found, wanted))
         there = there[other].reshape(here[acting].shape)
         np.testing.assert_allclose(here[acting][one], there, atol=atol)
 

@@ -39,7 +39,7 @@ from mjx_drax.kernels import kept  # noqa: E402
 # Again as configuration, in case a plugin of pytest imported jax before the lines above.
 for _option, _value in {
     "jax_compilation_cache_dir": os.environ["JAX_COMPILATION_CACHE_DIR"],
-    "jax_persistent_cache_min_compile_time_secs": 0.2,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": 0,
     "jax_disable_most_optimizations": _quick,
 }.items():
@@ -93,14 +93,24 @@ def models_are_trusted(request):
     if "physics" in request.path.parts:
         yield
         return
+    with pytest.MonkeyPatch.context() as patch:
+        _trust_models(patch)
+        yield
+
+
+@pytest.fixture
+def trusted(monkeypatch):
+    """The same for a test in `physics` that asks something else of its model."""
+    _trust_models(monkeypatch)
+
+
+def _trust_models(patch):
     from mjx_drax.physics.agreement.checks import Findings, StepErrors
 
     def nothing(*_):
         return Findings(StepErrors(np.zeros(1)), (), None)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mjx_drax.physics.mjcf.examine", nothing)
-        yield
+    patch.setattr("mjx_drax.physics.mjcf.examine", nothing)
 
 
 SLIDER = """

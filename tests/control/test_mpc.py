@@ -149,8 +149,13 @@ def test_float64_stays_float64():
         assert weight == np.sqrt(DT)  # of `hold`, to the last bit
 
 
-def test_a_problem_in_float64_is_planned_for_in_float64():
-    policy = MPC(balance().in_float64(), chains=2, explorers=1, hold=1.0, solver=FAST)
+@pytest.fixture(scope="module")
+def in_float64():
+    return MPC(balance().in_float64(), chains=2, explorers=1, hold=1.0, solver=FAST)
+
+
+def test_a_problem_in_float64_is_planned_for_in_float64(in_float64):
+    policy = in_float64
     x = np.array([0.5, 0.0])
     for k in range(3):
         x = stepped(x, policy(x, k * DT))
@@ -158,8 +163,8 @@ def test_a_problem_in_float64_is_planned_for_in_float64():
     assert policy.latest.x.dtype == np.float64
 
 
-def test_going_back_keeps_the_precision_and_gives_the_same_plans():
-    policy = MPC(balance().in_float64(), chains=2, explorers=1, solver=FAST)
+def test_going_back_keeps_the_precision_and_gives_the_same_plans(in_float64):
+    policy = in_float64
     policy.reset([0.5, 0.0])
     first = [policy.plan([0.4, 0.1], DT).u, policy.plan([0.3, 0.1], 2 * DT).u]
     policy.rewind()

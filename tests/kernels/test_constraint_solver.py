@@ -166,14 +166,16 @@ def test_the_kernel_finds_the_same_accelerations(make):
 
 @pytest.mark.skipif(not shutil.which("g++"), reason="it needs a C++ compiler")
 @pytest.mark.parametrize(
-    ("nv", "m", "dtype"),
+    ("nv", "m", "dtype", "iterations"),
     [
-        (5, 7, np.float64),  # one warp, small tiles
-        (18, 140, np.float64),  # several warps, large tiles
-        (5, 7, np.float32),
+        (5, 7, np.float64, 1),  # one warp, small tiles
+        (5, 7, np.float64, 20),
+        pytest.param(18, 140, np.float64, 1, marks=pytest.mark.slow),
+        (18, 140, np.float64, 20),  # several warps, large tiles
+        pytest.param(5, 7, np.float32, 1, marks=pytest.mark.slow),
+        (5, 7, np.float32, 20),
     ],
 )
-@pytest.mark.parametrize("iterations", [1, 20])
 def test_the_kernel_of_cuda_finds_the_same_accelerations(
     nv, m, dtype, iterations, tmp_path, monkeypatch
 ):
@@ -194,8 +196,8 @@ def test_the_kernel_of_cuda_finds_the_same_accelerations(
 @pytest.mark.parametrize(
     ("nv", "law", "contacts", "dtype", "iterations"),
     [
-        (5, 3, (2, 1, 1), np.float64, 1),  # one warp, small tiles
-        (5, 3, (2, 1, 1), np.float64, 20),
+        pytest.param(5, 3, (2, 1, 1), np.float64, 1, marks=pytest.mark.slow),
+        (5, 3, (2, 1, 1), np.float64, 20),  # one warp, small tiles
         (18, 0, (0, 40, 0), np.float64, 20),  # several warps, large tiles, more than 32 contacts
         (5, 1, (0, 2, 0), np.float32, 20),
     ],

@@ -21,22 +21,26 @@ KINDS = [(True, True), (False, True), (False, False), (True, False)]
 """Noise, and a penalty: the flow has one, the polish neither."""
 
 
+def interpreted(arguments, count):
+    return jax.jit(lambda given: newton_steps(given, count, interpret=True))(arrays_of(arguments))
+
+
 @pytest.mark.parametrize(("noisy", "soft"), KINDS)
 def test_it_agrees_with_the_plain_recursion(noisy, soft):
     with jax.enable_x64(True):
         arguments = batch(THREADS + 5, np.float64, noisy, soft=soft)  # two warps, one not full
         plain = jax.jit(jax.vmap(newton))(*arguments)
-        seen = newton_steps(arrays_of(arguments), 1, interpret=True)
+        seen = interpreted(arguments, 1)
         agree(seen, plain, 1e-9)
 
 
-@pytest.mark.parametrize("noisy", [True, False])
+@pytest.mark.parametrize("noisy", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_in_segments_it_agrees_with_the_plain_recursion(noisy):
     """Seven stages in three segments, of which the last is filled up; penalties up to 1e4."""
     with jax.enable_x64(True):
         arguments = batch(2, np.float64, noisy, K=7)
         plain = jax.jit(jax.vmap(newton))(*arguments)
-        agree(newton_steps(arrays_of(arguments), 3, interpret=True), plain, 1e-9)
+        agree(interpreted(arguments, 3), plain, 1e-9)
 
 
 def test_in_segments_what_no_control_moves_is_no_trouble():
@@ -45,7 +49,7 @@ def test_in_segments_what_no_control_moves_is_no_trouble():
     linear = replace(linear, A=0.5 * linear.A, B=linear.B.at[:, :, 1:].set(0.0))
     arguments = linear, cost, multipliers, jnp.full(2, 1e8, np.float32), white
     plain = jax.jit(jax.vmap(newton))(*arguments)
-    agree(newton_steps(arrays_of(arguments), 4, interpret=True), plain, 1e-3)
+    agree(interpreted(arguments, 4), plain, 1e-3)
 
 
 def test_segments_are_for_few_chains_and_many_stages():

@@ -197,6 +197,7 @@ def test_given_bounds_are_added_to_the_ranges():
     np.testing.assert_allclose(bounds.u_upper, [3.0, 5.0])
 
 
+@pytest.mark.usefixtures("trusted")
 @pytest.mark.parametrize("contact", [False, True])
 def test_controls_are_drawn_within_bounds_of_their_own_at_each_knot(contact):
     late = np.array([0.0, 0.0, 1.0, 2.0, 2.0])[:, None] * np.ones(2)
@@ -242,6 +243,7 @@ def test_horizon_counts_knots():
     assert task.times[-1] == pytest.approx(0.5)
 
 
+@pytest.mark.usefixtures("trusted")
 def test_the_initial_state_is_the_default_pose_or_the_first_keyframe_or_what_is_given():
     np.testing.assert_array_equal(problem(arm()).x_init, np.zeros(5))
     key = '<keyframe><key qpos="0.1 2" qvel="3 4" act="5"/><key qpos="0 9"/></keyframe>'
@@ -511,6 +513,7 @@ FALLING = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size
 <actuator><motor joint="j"/></actuator></mujoco>"""
 
 
+@pytest.mark.usefixtures("trusted")
 def test_replays_are_those_of_the_c_engine_and_a_chain_that_blows_up_leaves_others_alone():
     dynamics = from_mjcf(FALLING, horizon=0.4, dt=0.02, running_residual=lambda data, u: u).dynamics
     model, rng, chains, K = dynamics.mj_model, np.random.default_rng(0), 20, 20

@@ -100,6 +100,7 @@ def test_knots_in_a_batch_are_read_along_the_last_axes():
     assert jax.eval_shape(lambda data: data.joint("shoulder").qpos, shapes).shape == (2, 4)
 
 
+@pytest.mark.usefixtures("trusted")
 @pytest.mark.parametrize(
     ("read", "words"),
     [

@@ -140,7 +140,9 @@ def test_a_cpu_is_given_each_operation_once(monkeypatch):
     assert 100 < compiled.count(" multiply(") < 2 * len(products)
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize(
+    "integrator", ["Euler", "implicitfast", pytest.param("RK4", marks=pytest.mark.slow)]
+)
 def test_derivatives_in_closed_form_are_those_of_the_operations(integrator):
     xml = EVERYTHING.replace("<option", f'<option integrator="{integrator}"')
     with jax.enable_x64(True):

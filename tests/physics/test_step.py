@@ -336,6 +336,7 @@ def test_float64_has_the_c_engines_numbers_and_changed_ones():
     np.testing.assert_allclose(masses, 1.5 * problem.dynamics.mj_model.body_mass, rtol=1e-7)
 
 
+@pytest.mark.usefixtures("trusted")
 def test_replays_do_not_depend_on_those_before():
     """They take turns with the same data of the C engine, even after a motion that diverged."""
     d = tasks.load("hopper_jump").make().dynamics

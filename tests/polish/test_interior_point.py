@@ -45,7 +45,7 @@ CASES["hs052"] = 2  # exactly: where nothing is left to gain, no step more is ta
 CASES["double_pendulum_swingup"] = 60  # 274 if its curvature is only learned
 
 
-QUICK = ("hs071", "hs052", "hs078")
+QUICK = ("hs071", "hs052")
 
 
 @pytest.mark.usefixtures("float64")

@@ -1,5 +1,7 @@
 """Which step the polish takes along a direction."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,11 +60,17 @@ def searched(way, rows, common, *more):
     return jax.jit(jax.vmap(lambda own, *more: way(Ray(**own, **common), *more)))(rows, *more)
 
 
+@cache
+def alone(seed=0):
+    """Rays, and the steps that each of them takes by itself."""
+    rows, common = rays(seed)
+    return rows, common, searched(line_search._side_by_side, rows, common)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_chains_that_share_their_work_take_the_steps_that_they_would_take_alone(seed):
-    rows, common = rays(seed)
+    rows, common, (size, knots, through) = alone(seed)
     needed = jnp.asarray(np.random.default_rng(seed).random(ROWS) < 0.8)
-    size, knots, through = searched(line_search._side_by_side, rows, common)
     shared = searched(line_search.line_search, rows, common, needed)
     steps = np.asarray(size / rows["reach"])
     assert len(np.unique(steps.round(4))) >= 5  # 0, too
@@ -75,13 +83,12 @@ def test_chains_that_share_their_work_take_the_steps_that_they_would_take_alone(
 
 
 def test_one_chain_alone_takes_the_same_step():
-    rows, common = rays()
-    size, knots, _ = searched(line_search._side_by_side, rows, common)
+    rows, common, (size, knots, _) = alone()
+    search = jax.jit(lambda own: line_search.line_search(Ray(**own, **common), jnp.ones((), bool)))
     for i in np.flatnonzero(np.asarray(size) > 0.0)[:4]:
-        ray = Ray(**jax.tree.map(lambda a, i=i: a[i], rows), **common)
-        alone = line_search.line_search(ray, jnp.ones((), bool))
-        np.testing.assert_allclose(alone[0], size[i], rtol=1e-6)
-        np.testing.assert_allclose(alone[1].x, knots.x[i], rtol=1e-5, atol=1e-5)
+        found = search(jax.tree.map(lambda a, i=i: a[i], rows))
+        np.testing.assert_allclose(found[0], size[i], rtol=1e-6)
+        np.testing.assert_allclose(found[1].x, knots.x[i], rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +96,7 @@ def test_one_chain_alone_takes_the_same_step():
     [(False, 0, True), (True, 0, False), (True, 1_000, False), (True, 3_000, True)],
 )
 def test_gpus_share_the_work_where_it_is_dear(gpu, constraint_rows, shared, monkeypatch):
-    rows, common = rays()
-    size, *_ = searched(line_search._side_by_side, rows, common)
+    rows, common, (size, *_) = alone()
     kind = type(common["problem"].dynamics)
     monkeypatch.setattr(kind, "constraint_rows", constraint_rows)
     monkeypatch.setattr(line_search, "on_gpu", lambda: gpu)

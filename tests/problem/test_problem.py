@@ -66,7 +66,7 @@ def test_a_horizon_that_is_no_multiple_of_the_step_is_told_how_long_the_plan_is(
     ("x", "inequality", "told"),
     [
         ([0.5], lambda x, u: jnp.array([x[0] - 1.0, x[0] - 0.2]), r"inequality \[1\] by 0\.3"),
-        ([0.5], lambda x, u: x[0] - 1.0, None),
+        pytest.param([0.5], lambda x, u: x[0] - 1.0, None, marks=pytest.mark.slow),
         ([0.5], lambda x, u: x + u - 0.2, None),  # a control can keep it
         ([2.0], between(lambda x, u: x - 1.0, 0.5, 1.0), None),
     ],

@@ -71,7 +71,7 @@ def test_a_batch_takes_the_chains_that_reach_the_goal():
 def test_a_batch_without_any_says_so_once():
     never = wells(goal=lambda x: False)
     one = Restarts(attempts=1)
-    found = solve_batch(never.with_x_init, STARTS, chains=2, solver=one, progress=False)
+    found = solve_batch(never.with_x_init, STARTS, chains=8, solver=one, progress=False)
     assert [found.where(i).kind for i in range(3)] == ["goal"] * 3
     assert "there are none" in str(found)
     assert "nan" not in str(found)

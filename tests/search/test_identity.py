@@ -299,7 +299,7 @@ def traced(program):
     raise AssertionError(f"{program.__name__} was traced")
 
 
-@pytest.mark.parametrize("kind", ["function", "model"])
+@pytest.mark.parametrize("kind", [pytest.param("function", marks=pytest.mark.slow), "model"])
 def test_a_second_process_solves_alike_without_tracing(monkeypatch, keeps_programs, kind):
     def anew():
         return posed() if kind == "function" else robot(running_cost=lambda d, u: u[0] ** 2)

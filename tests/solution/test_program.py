@@ -263,7 +263,7 @@ def test_a_guess_that_is_a_number_is_named(linear):
         minimize(linear, chains=2, guess=0.0)
 
 
-@pytest.mark.parametrize("units", [1e-6, 1e3, 1e6])
+@pytest.mark.parametrize("units", [1e-6, pytest.param(1e3, marks=pytest.mark.slow), 1e6])
 def test_units_of_constraints_do_not_matter(units):
     program = from_program(
         4,

@@ -40,7 +40,11 @@ def solution():
     return solve(VALLEYS, CHAINS, solver=TWICE)
 
 
-@pytest.fixture(scope="module", params=[ONCE, TWICE], ids=["once", "twice"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(ONCE, marks=pytest.mark.slow), TWICE],
+    ids=["once", "twice"],
+)
 def batch(request):
     return solve_batch(from_start, STARTS, chains=CHAINS, solver=request.param)
 

@@ -1,5 +1,7 @@
 """Contacts of spheres and capsules with boxes, against those of MuJoCo's C engine."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -67,6 +69,18 @@ def test_a_capsule_that_is_parallel_to_sides_of_a_box_touches_in_the_same_points
                 )
 
 
+@cache
+def slopes(one):
+    """Derivatives of contacts by where the geoms are, compiled once for all poses."""
+    on_device = put_model(paired(one))
+    data, collide = make_data(on_device), getattr(boxes, f"{one}_box")
+
+    def of(pos, mat):
+        return collide(on_device, data.replace(geom_xpos=pos, geom_xmat=mat), jnp.array([[0, 1]]))
+
+    return jax.jit(jax.jacfwd(of, (0, 1)))
+
+
 @pytest.mark.parametrize("one", ["sphere", "capsule"])
 @pytest.mark.parametrize(
     "apart",
@@ -74,15 +88,9 @@ def test_a_capsule_that_is_parallel_to_sides_of_a_box_touches_in_the_same_points
 )
 def test_in_symmetric_poses_derivatives_are_finite(one, apart):
     model = paired(one)
-    on_device, at = put_model(model), mujoco.MjData(model)
+    at = mujoco.MjData(model)
     at.qpos[7:10] = apart
     mujoco.mj_kinematics(model, at)
-    data = make_data(on_device)
-    collide = {"sphere": boxes.sphere_box, "capsule": boxes.capsule_box}[one]
-
-    def of(pos, mat):
-        return collide(on_device, data.replace(geom_xpos=pos, geom_xmat=mat), jnp.array([[0, 1]]))
-
     pose = jnp.asarray(at.geom_xpos), jnp.asarray(at.geom_xmat).reshape(-1, 3, 3)
-    for derivative in jax.tree.leaves(jax.jacfwd(of, (0, 1))(*pose)):
+    for derivative in jax.tree.leaves(slopes(one)(*pose)):
         assert np.isfinite(derivative).all()

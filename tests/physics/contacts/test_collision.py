@@ -389,7 +389,7 @@ def test_pairs_one_by_one_touch_as_all_at_once():
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1] * 3, margin=0.05)
     with jax.enable_x64(True):
         model = put_model(spec.compile())
-        data = mjx.kinematics(model, make_data(model))
+        data = jax.jit(mjx.kinematics)(model, make_data(model))
         at_once = jax.jit(lambda: collision(model, data)._impl.contact)()
         with hulls_of_one_size():
             one_by_one = jax.jit(lambda: collision(model, data)._impl.contact)()

@@ -37,6 +37,7 @@ ON_TOP = """
 """
 
 
+@pytest.mark.usefixtures("trusted")
 @pytest.mark.parametrize("cone", ["pyramidal", pytest.param("elliptic", marks=pytest.mark.slow)])
 def test_they_and_their_derivatives_are_those_of_the_rows(cone):
     model = mujoco.MjModel.from_xml_string(ON_TOP.format(cone=cone))
