@@ -185,7 +185,8 @@ def test_kept_programs_do_not_tell_the_lines_of_their_code():
     (known,) = used._programs.values()
     assert "multiply" in known.as_text()
     assert "stack_frame_id" not in known.as_text()
-    assert "stack_frame_id" in used.lower(X, 3).compile().as_text()
+    with kept.unknown_to_jax():  # whose cache may have one without, from another process
+        assert "stack_frame_id" in used.lower(X, 3).compile().as_text()
 
 
 def test_lines_of_code_are_told_again_once_nobody_leaves_them_out():
