@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -33,6 +34,17 @@ def plain_array(leaf: Any) -> np.ndarray:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
     return np.asarray(leaf)
+
+
+def code_files() -> list[Path]:
+    """Of this package, in Python and in CUDA."""
+    package = Path(__file__).parents[1]
+    return sorted([*package.rglob("*.py"), *package.rglob("*.cu*")])
+
+
+def code() -> str:
+    """Of this package's own code."""
+    return digest(b"".join(file.read_bytes() for file in code_files()))
 
 
 def versions() -> dict[str, str]:

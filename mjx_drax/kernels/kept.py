@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
-from mjx_drax.base.digests import DIGEST, digest, versions
+from mjx_drax.base.digests import DIGEST, code, code_files, digest, versions
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import complete
 from mjx_drax.base.meanwhile import Meanwhile
@@ -167,11 +167,8 @@ def _machine() -> tuple[Any, ...] | None:
 
     None if the code was edited after it was loaded: its digest is not that of what runs.
     """
-    package = Path(__file__).parents[1]
-    files = sorted([*package.rglob("*.py"), *package.rglob("*.cu*")])
-    if max(max(stat.st_mtime, stat.st_ctime) for stat in map(Path.stat, files)) > _LOADED:
+    if max(max(stat.st_mtime, stat.st_ctime) for stat in map(Path.stat, code_files())) > _LOADED:
         return None
-    code = b"".join(file.read_bytes() for file in files)
     device = jax.local_devices()[0]
     processor: list[Any] = [platform.machine(), platform.processor(), os.cpu_count()]
     with suppress(OSError):
@@ -180,7 +177,7 @@ def _machine() -> tuple[Any, ...] | None:
     return (
         sorted(versions().items()),
         version("jaxlib"),
-        digest(code),
+        code(),
         (device.platform, device.device_kind, device.client.platform_version),
         processor,
     )

@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_drax.base.digests import DIGEST, digest, plain_array, versions
+from mjx_drax.base.digests import DIGEST, code, digest, plain_array, versions
 from mjx_drax.base.errors import DraxError, DraxWarning
 from mjx_drax.base.files import complete, file_path
 from mjx_drax.base.files import require_room as require_room_for
@@ -155,6 +155,7 @@ def facts(problem: Problem, chains: int, seed: int, settings: Any) -> dict[str, 
         "seed": int(seed),
         **_flat("settings", settings),
         **_flat("version", versions()),
+        "code of mjx_drax": code(),
         "device": jax.devices()[0].device_kind,
         "horizon": problem.horizon,
         **{f"numbers in problem.{_name(path)}": digest(leaf) for path, leaf in leaves},

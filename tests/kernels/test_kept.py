@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_drax.base import digests
 from mjx_drax.kernels import kept
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.kernels.kept import folder
@@ -100,8 +101,7 @@ def test_precision_and_settings_surround_a_program():
 def test_the_code_of_this_package_surrounds_a_program(monkeypatch, tmp_path):
     machine = kept._machine.__wrapped__
     here, code = machine(), tmp_path / "other.py"
-    (tmp_path / "kernels").mkdir()
-    monkeypatch.setattr(kept, "__file__", str(tmp_path / "kernels" / "kept.py"))
+    monkeypatch.setattr(digests, "__file__", str(tmp_path / "base" / "digests.py"))
     monkeypatch.setattr(kept, "_LOADED", np.inf)
     found = []
     for content in ("x = 1\n", "x = 2\n"):

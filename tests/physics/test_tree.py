@@ -56,6 +56,13 @@ def test_frames_are_those_of_mjx(model):
             np.testing.assert_allclose(ours, theirs, atol=1e-9, err_msg=name)
 
 
+def test_compilers_compute_each_round_of_frames_once():
+    _, device, data = drawn(EVERY_JOINT)
+    program = jax.make_jaxpr(kinematics)(device, data)
+    # three rounds for five frames in a row, of positions with matrices, and of quaternions
+    assert str(program).count("optimization_barrier") == 2 * 3
+
+
 @pytest.mark.parametrize(
     ("model", "gravity"), [(EVERY_JOINT, True), (EVERY_JOINT, False), ("humanoid", True)]
 )

@@ -398,6 +398,12 @@ def test_another_question_is_refused(written, changes, words):
     assert written.read_bytes() == before
 
 
+def test_a_file_that_other_code_has_written_is_refused(written, monkeypatch):
+    monkeypatch.setattr(checkpoint, "code", lambda: "sha256:0")
+    with pytest.raises(DraxError, match="written for other code of mjx_drax than this solve has"):
+        solved(checkpoint=written)
+
+
 @pytest.mark.slow
 def test_names_and_goals_are_no_part_of_the_question(written, whole):
     other = problem(goal=lambda x: False, name="other")

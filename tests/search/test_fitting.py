@@ -143,7 +143,7 @@ def test_motions_that_do_not_fit_the_default_box_are_found(far):
         np.inf,
         u_bounds=None,
         running_cost=None,
-        running_residual=Partial(effort, 0.1 / far),  # both distances have one program
+        running_residual=Partial(effort, 0.1 / far),  # all distances have one program
         terminal_equality=Partial(miss, jnp.array([far, 0.0])),
     )
     with warnings.catch_warnings(record=True) as told:

@@ -17,6 +17,7 @@ from mjx_drax.search.units import units_of, with_units
 
 DT, K = 0.1, 20
 SCALES = [1e-6, 1e6]
+MOSTLY_LARGE = [pytest.param(1e-6, marks=pytest.mark.slow), 1e6]
 
 
 def push(x, u):
@@ -93,7 +94,7 @@ def test_a_constraint_of_one_knot_counts_and_one_that_is_constant_does_not():
     assert partly_nan > 1e3
 
 
-@pytest.mark.parametrize("scale", [pytest.param(1e-6, marks=pytest.mark.slow), 1e6])
+@pytest.mark.parametrize("scale", MOSTLY_LARGE)
 def test_the_same_motion_comes_out_and_multipliers_are_the_users(scale):
     mine, found = answer(1.0), answer(scale)
     assert found.certified
@@ -109,7 +110,7 @@ def test_the_same_motion_comes_out_and_multipliers_are_the_users(scale):
     np.testing.assert_allclose(slack, -g, atol=1e-3 * scale)
 
 
-@pytest.mark.parametrize("scale", [pytest.param(1e-6, marks=pytest.mark.slow), 1e6])
+@pytest.mark.parametrize("scale", MOSTLY_LARGE)
 def test_a_warm_start_goes_on_where_the_answer_was(scale):
     again = solve(problem_in(scale), chains=4, guess=answer(scale), progress=False)
     assert again.optimal
