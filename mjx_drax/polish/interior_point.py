@@ -93,8 +93,11 @@ MEASURED n iterations, and used below CLOSE."""
 BLOCKED, RAISE = 0.1, 3.0
 """Steps to the boundary shorter than BLOCKED raise the barrier's weight by a factor RAISE."""
 
-LOOSE, STIFFER = 0.1, 10.0
-"""Where a step leaves more than LOOSE of the constraints, their penalties grow by STIFFER."""
+LOOSE, STIFFER, SOFTER = 0.1, 10.0, 1000.0
+"""Where a step leaves more than LOOSE of the constraints, their penalties grow by STIFFER. Where
+slacks of constraints that do not hold leave only steps below BLOCKED, they fall by SOFTER, to at
+least 1: the linearized constraints then have no solution with positive slacks, and steps towards
+one only use the slacks up (Waechter and Biegler, 2000)."""
 
 KEPT, RAISED = 0.1, 1e3
 """Where with eta = |lambda| a step would raise the merit function, eta grows, by at most RAISED,
@@ -357,7 +360,10 @@ def _moved(
     assert v is not None  # for the type checker
     assert derivatives is not None
     ends = slacks_of(problem, knots)
+    # defects cost nothing before the first step: all multipliers are 0
+    known = (now.iterations > 0) | (state.multipliers.dynamics != 0.0).any()
     rho = _barrier(problem, knots, v, now.barrier, residual, polish, scales)
+    rho = jnp.where(known, rho, now.barrier)
 
     central = _central(problem, knots, rho)
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
@@ -435,6 +441,10 @@ def _moved(
     loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
     most = 1e-2 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
     stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
+    if knots.slack is not None:
+        unmet = worst(Multipliers(left.dynamics, model.h.constraints), rows) > polish.tolerance
+        jammed = unmet & (_largest(ends[0].slack, moves.slack, share) < BLOCKED)
+        stiffness = jnp.where(jammed, jnp.maximum(now.stiffness / SOFTER, 1.0), stiffness)
     blocked = jnp.minimum(RAISE * rho, 0.1 * scales.terms)
     arrived = replace(now, optimal=done, residual=jnp.maximum(residual.total, gain))
     moved = replace(
@@ -595,7 +605,9 @@ def _displacement(problem: Problem, knots: Trajectory, d: Trajectory) -> Traject
     return replace(d, x=problem.displaced(knots, d).x - knots.x)
 
 
-def _largest(slacks: Trajectory, moves: Trajectory, share: Array) -> Array:
+def _largest(
+    slacks: Trajectory | Stagewise | None, moves: Trajectory | Stagewise | None, share: Array
+) -> Array:
     """The largest step, at most 1, that uses up no more than that share of any slack."""
 
     def largest(slack: Array, move: Array) -> Array:

@@ -259,15 +259,9 @@ def test_ipopt_finds_all_known_optima(name):
         assert answer.cost == pytest.approx(known, rel=error, abs=1e-7)
 
 
-def _marks(name):
-    """All but one problem are slow; one ends at another optimum from its guess, 3 % longer."""
-    worse = pytest.mark.xfail(name == "brachistochrone_time", reason="a local optimum", strict=True)
-    return [worse] if name == "tracking" else [worse, pytest.mark.slow]
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("name", [pytest.param(name, marks=_marks(name)) for name in OPEN])
+@pytest.mark.parametrize("name", OPEN)
 def test_open_problems_end_at_their_published_optima(name):
     _, residual, cost, status = suite.ours(*suite.posed(name))
     assert (status, residual <= suite.TOLERANCE) == ("optimal", True)
