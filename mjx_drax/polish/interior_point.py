@@ -13,6 +13,8 @@ is in units of a user's: D, the penalties of constraints and the barrier's weigh
     step        the largest of a ladder, up to the boundary, that lowers the merit function
                 c - rho sum log(slacks) + sum eta |h|,  eta >= |lambda|   (Armijo; Han 1977), or
                 its first two terms, while h stays within a funnel that narrows (`line_search`)
+    penalties   of constraints grow where steps leave too much of them, and fall where their
+                slacks leave only short steps (SOFTER)
     barrier     rho falls when its problem is nearly solved (`_barrier`), and rises where the
                 boundary leaves only short steps
     end         the `residual`, and what the model promises to gain, or the last one did, relative
@@ -360,7 +362,7 @@ def _moved(
     assert v is not None  # for the type checker
     assert derivatives is not None
     ends = slacks_of(problem, knots)
-    # defects cost nothing before the first step: all multipliers are 0
+    # Before the first step multipliers are 0, and defects would seem to cost nothing
     known = (now.iterations > 0) | (state.multipliers.dynamics != 0.0).any()
     rho = _barrier(problem, knots, v, now.barrier, residual, polish, scales)
     rho = jnp.where(known, rho, now.barrier)
@@ -605,9 +607,7 @@ def _displacement(problem: Problem, knots: Trajectory, d: Trajectory) -> Traject
     return replace(d, x=problem.displaced(knots, d).x - knots.x)
 
 
-def _largest(
-    slacks: Trajectory | Stagewise | None, moves: Trajectory | Stagewise | None, share: Array
-) -> Array:
+def _largest(slacks: Any, moves: Any, share: Array) -> Array:
     """The largest step, at most 1, that uses up no more than that share of any slack."""
 
     def largest(slack: Array, move: Array) -> Array:

@@ -239,16 +239,9 @@ def test_ipopt_finds_known_optima(name):
     assert 3 < answer.iterations < 50
 
 
-def _lengthens(name):
-    """IPOPT lets one chain grow without end, as docs/benchmarks.md says."""
-    return pytest.mark.xfail(name == "hanging_chain", reason="not solved by IPOPT", strict=True)
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=_lengthens(name)) for name in (*CASES, *PROGRAMS)]
-)
+@pytest.mark.parametrize("name", [*CASES, *PROGRAMS])
 def test_ipopt_finds_all_known_optima(name):
     pytest.importorskip("casadi")
     known = PROGRAMS[name].optimum if name in PROGRAMS else CASES[name].optimum
