@@ -26,23 +26,16 @@ from jax.sharding import Mesh
 
 from mjx_drax.base.digests import digest
 from mjx_drax.kernels.compilation import rarely_collected, while_compiling
-from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
+from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin, State
 from mjx_drax.method.schedules import Scale
-from mjx_drax.polish.interior_point import Polish
-from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search import rounds
 from mjx_drax.search.attempts import (
-    AttemptSoFar,
-    done_up_to,
-    noise_is_better,
-    owners_of_places,
     stricter,
     temperature,
-    wanted,
 )
 from mjx_drax.search.chains import (
-    CHEAPER,
     Chains,
     Stage,
     best_of,
@@ -58,22 +51,19 @@ from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
 from mjx_drax.search.devices import gathered, on_host, split_over
 from mjx_drax.search.family import Family
-from mjx_drax.search.initial import initial_knots
+from mjx_drax.search.initial import initial_knots, knots_by_row, problem_keys
 from mjx_drax.search.iterate import (
     FEASIBLE,
     Question,
     begin,
-    box_of_controls,
-    chain_keys,
     iterate,
-    joined,
     noise_at,
 )
+from mjx_drax.search.policy import Policy
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.replayer import Replayer
-from mjx_drax.search.restarts import Restarts, scale_of
+from mjx_drax.search.restarts import Restarts, Rollouts, scale_of
 from mjx_drax.search.settings import to_data
-from mjx_drax.search.shooting import Shots, shoot
 from mjx_drax.search.sizes import Sizes, median, scale_and_floor, sizes_of
 from mjx_drax.search.units import to_units, units_of
 from mjx_drax.search.warm import Warm, warmed
@@ -81,9 +71,6 @@ from mjx_drax.search.warm import Warm, warmed
 REPORT_EVERY = 20
 """Iterations between two reports, records of the history, and chances to interrupt; a hundredth
 of an attempt's where that is more."""
-
-STRAGGLERS = 0.0005
-"""Share of chains for which the polish of the others does not wait."""
 
 MANY, FEWER = 2048, 8
 """A batch of at least MANY chains has a second program, for a FEWER-th of its problems: what still
@@ -204,15 +191,16 @@ class Search:
     # Attempts and chunks
 
     @property
-    def polish(self) -> Polish | None:
-        """What follows the noise; None: the flow's tail."""
-        polish = self.settings.polish
-        return polish if polish and polish.iterations else None
+    def policy(self) -> Policy:
+        """What decides of its chains."""
+        return Policy(self.settings, self.chains, self.family.alone, self.mesh)
 
     @property
     def few(self) -> int:
         """Problems of the second program; 0: there is none."""
-        many = self.size * self.chains >= MANY and self.mesh is None and self.polish is not None
+        many = (
+            self.size * self.chains >= MANY and self.mesh is None and self.policy.polish is not None
+        )
         return self.size // FEWER if many and not self.family.alone else 0
 
     def places(self, attempt: int) -> int:
@@ -343,7 +331,7 @@ class Search:
 
     def _polished(self, guessed: Chains) -> Chains:
         """A guess after a polish of its own, which no attempt has made of it as it is."""
-        if self.polish is None or isinstance(self.guess, Warm):
+        if self.policy.polish is None or isinstance(self.guess, Warm):
             return guessed
         noisy = self.flow.iterations  # after which a chain would be rolled out
         state, info = self._iterated(guessed.state, noisy + 1, noisy + self.settings.after)
@@ -392,7 +380,7 @@ class Search:
         sizes = jax.tree.map(np.asarray, self._sizes(stage.now.state))
         of_problem = jax.tree.map(lambda a: a.reshape(len(indices), -1), sizes)
         scale, floor = stage.cost_scale.copy(), stage.floor.copy()
-        scale[indices], floor[indices] = scale_and_floor(of_problem, self.polish is not None)
+        scale[indices], floor[indices] = scale_and_floor(of_problem, self.policy.polish is not None)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
         self._settle(0, False, indices, scale)
 
@@ -426,38 +414,16 @@ class Search:
                 self.chunk_done(N - todo + place, N)
 
     def _next_attempt(self) -> bool:
-        """Go on to another attempt, or finish; False if nothing more is to be done.
-
-        With `heated=True` the second attempt has noise, and so have later ones at a single problem
-        if noise has brought more chains, or if all attempts are asked for. With `heated=None`
-        attempts at a single problem are with and without noise in turns until one has made a chain
-        done; from then on they are of the kind that has brought more. In a batch, where answers
-        must not depend on others, all have noise, or none.
-        """
-        stage, settings, family = self.stage, self.settings, self.family
-        kept, everyone = stage.kept, np.arange(family.count)
+        """Go on to another attempt, or finish; False if nothing more is to be done."""
+        stage, policy, family = self.stage, self.policy, self.family
+        kept = stage.kept
         assert kept is not None
-        assert settings.done_share is not None
         if stage.finishing:
-            assert self.polish is not None
-            return stage.finishing < self.polish.patience and self._begin_to_finish()
-        bar = self._done_up_to(everyone)
-        missing = (self._sound_costs(kept, everyone) > bar).sum(axis=1)
-        found = np.array([(end - stage.floor[0] <= bar[0]).sum() for end in stage.ends])
-        many = self.chains
-        if family.alone and stage.attempt == 0:
-            many = wanted(self.chains, self.places(0))
-            missing = np.maximum(many - found[:1], 0)
-        todo = np.flatnonzero(missing > (1.0 - settings.done_share) * many)
-        if stage.attempt + 1 == settings.attempts or not len(todo):
+            assert policy.polish is not None
+            return stage.finishing < policy.polish.patience and self._begin_to_finish()
+        todo, heated = policy.next_attempt(stage, self.places(0))
+        if stage.attempt + 1 == self.settings.attempts or not len(todo):
             return self._begin_to_finish()
-        heated = bool(settings.heated)
-        if family.alone:
-            better = noise_is_better(found, stage.work)
-            if settings.heated is None:
-                heated = better if found.any() else not stage.heated
-            elif stage.attempt > 0 and not self._thorough:
-                heated &= better
         scale = stricter(stage.cost_scale, kept.feasible.reshape(family.count, self.chains))
         self.stage = replace(
             stage, attempt=stage.attempt + 1, heated=heated, cost_scale=scale, todo=todo, place=0
@@ -467,10 +433,10 @@ class Search:
     def _begin_to_finish(self) -> bool:
         """Continue the polish of kept chains that were stopped early; False if there are none."""
         stage, kept = self.stage, self.stage.kept
-        if not self._ends_early:
+        if not self.policy.ends_early:
             return False
         assert kept is not None
-        unfinished = self._unfinished(kept)
+        unfinished = self.policy.unfinished(stage, kept)
         if not unfinished.any():
             return False
         done = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
@@ -498,88 +464,13 @@ class Search:
         """Which chain each place of the first attempt's has, where all go on, (places,)."""
         return np.resize(np.arange(self.chains), self.places(0))
 
-    @property
-    def _ends_early(self) -> bool:
-        """Whether attempts end early, and a finish follows: not if rollouts follow."""
-        rollouts = self.settings.rollouts
-        assert rollouts is not None
-        polished = self.polish is not None
-        asked = self.family.alone and polished and not self._thorough
-        return asked and not rollouts.asked
-
-    @property
-    def _thorough(self) -> bool:
-        """Whether all attempts are asked for, to find better optima than those that come easily."""
-        assert self.settings.done_share is not None
-        return self.settings.done_share > 1.0
-
-    def _unfinished(self, chains: Chains) -> np.ndarray:
-        """Which chains the finish polishes, (rows,): those that move and have iterations left.
-
-        They need one more in the end, which measures their residual. For a share `STRAGGLERS` it
-        does not wait. While no chain at the best cost has settled, or none is sound, those there
-        get more.
-        """
-        polish = self.polish
-        assert polish is not None
-        moves = self._moving(chains.state)
-        done, most = on_host(chains.state.polish.iterations, self.mesh), polish.iterations - 1
-        left = moves & (done < most)
-        if left.sum() > STRAGGLERS * self.chains:
-            return left
-        costs, size = chains.sound_cost - self.stage.floor[0], np.asarray(chains.info.size)
-        bar = done_up_to(costs, size, CHEAPER, self.stage.cost_scale[0])
-        near = costs <= bar if chains.sound.any() else moves
-        return moves & near & (done < polish.patience * most) & (moves | ~near).all()
-
-    def _moving(self, state: State) -> np.ndarray:
-        """Which chains the polish still moves, (rows,)."""
-        flags = state.polish.optimal, state.polish.stalled, state.alive
-        optimal, stalled, alive = on_host(flags, self.mesh)
-        return np.asarray(replace(state.polish, optimal=optimal, stalled=stalled).active & alive)
-
-    def _sound_costs(self, chains: Chains, indices: np.ndarray) -> np.ndarray:
-        """Costs of those problems' chains, from their floors, (len(indices), chains)."""
-        costs = self._costs_to_beat(chains, self.family.count)[indices]
-        return costs - self.stage.floor[indices, None]
-
-    def _costs_to_beat(self, chains: Chains, problems: int) -> np.ndarray:
-        """`sound_cost` of chains, (problems, each).
-
-        In a batch many goals may be out of reach: a chain that misses counts, where all do.
-        """
-        if self.family.alone:
-            return chains.sound_cost.reshape(problems, -1)
-        feasible, missed = (a.reshape(problems, -1) for a in (chains.feasible, chains.missed))
-        arrives = (feasible & ~missed).any(axis=1, keepdims=True)
-        costs = chains.cost.reshape(problems, -1)
-        return np.where(feasible & ~(missed & arrives), costs, np.inf)
-
-    def _done_up_to(self, indices: np.ndarray, now: Chains | None = None) -> np.ndarray:
-        """Up to which cost, from their floors, chains of those problems are done, (n, 1).
-
-        By what is kept, and by the rows of the chunk `now`. Where cheaper plans miss the goal, what
-        reaches it may be far from its best, so no chain is done.
-        """
-        stage, kept, n = self.stage, self.stage.kept, len(indices)
-        costs, sizes = [stage.least[indices, None]], [np.full((n, 1), np.nan)]
-        if kept is not None:
-            costs.append(self._sound_costs(kept, indices))
-            sizes.append(np.asarray(kept.info.size).reshape(-1, self.chains)[indices])
-        if now is not None:
-            costs.append(self._costs_to_beat(now, n) - stage.floor[indices, None])
-            sizes.append(np.asarray(now.info.size).reshape(n, -1))
-        assert self.settings.within is not None
-        both = np.concatenate(costs, axis=1), np.concatenate(sizes, axis=1)
-        return done_up_to(*both, self.settings.within, stage.cost_scale[indices])
-
     def _merged(self) -> Chains:
         """The best of all attempts, this one included."""
         stage, kept, now = self.stage, self.stage.kept, self._whole(self.stage.now)
         if stage.finishing:
             assert kept is not None
             return finished(kept, now, stage.floor[0])
-        owners = self._owners(now)
+        owners = self.policy.owners(stage, self.indices, now)
         if self.recorder is not None:
             self.recorder.belong(owners.ravel(), now.missed)
         if kept is None:
@@ -597,21 +488,6 @@ class Search:
         best = best_of(mine, found, (owners[:fresh] + first).ravel())
         jax.tree.map(lambda a, new: a.__setitem__(rows, new), kept, best)
         return kept
-
-    def _owners(self, now: Chains) -> np.ndarray:
-        """Which of its problem's chains gets what each place of the chunk has found, (n, places).
-
-        In the first attempt at a single problem the best places are its chains, -1 elsewhere.
-        """
-        indices, kept, share = self.indices, self.stage.kept, self.settings.done_share
-        order = now.order(len(indices))
-        if kept is None:
-            owners = np.full_like(order, -1)
-            owners[0, np.sort(order[0, : self.chains])] = np.arange(self.chains)
-            return owners
-        assert share is not None
-        cost, bar = self._sound_costs(kept, indices), self._done_up_to(indices, now)
-        return owners_of_places((cost <= bar) & (share <= 1.0), cost, order)
 
     def _best(self, now: Chains) -> Info:
         """Of the places as many as there are chains."""
@@ -637,10 +513,10 @@ class Search:
                 first = self.guess.knots
             knots = initial_knots(self.family.problem, self.places(attempt), first, key_knots)
             return knots, key_noise
-        keys = _keys_of(key, indices)
+        keys = problem_keys(key, indices)
         guess = self.family.problem.guess
         shared, own = self.family.question(self.settings.flow, Scale(1.0, 1.0), indices, 1)
-        return _drawn_by_row(own.problem, shared.problem, keys, self.chains, guess)
+        return knots_by_row(own.problem, shared.problem, keys, self.chains, guess)
 
     def _settle(
         self, attempt: int, heated: bool, indices: np.ndarray, cost_scale: np.ndarray
@@ -671,7 +547,9 @@ class Search:
         else:
             self.flow = replace(flow, scale=scale_of(1.0, 1.0))
         scale = Scale(cost, noise)
-        shared, own = self.family.question(self.flow, scale, indices, self.chains, self.polish)
+        shared, own = self.family.question(
+            self.flow, scale, indices, self.chains, self.policy.polish
+        )
         # once: to send its dozens of numbers with every launch takes longer than an iteration
         self.question = jax.device_put(shared), own
         program = partial(iterate if self.mesh is None else iterate.traced, tail=settings.after > 0)
@@ -699,12 +577,12 @@ class Search:
         total = flow.iterations + self.settings.after
         before = self.stage.done - self.stage.step if self.family.alone else 0
         try:
-            while self.stage.step < total and self._waits(self.stage.now):
+            while self.stage.step < total and self._waits():
                 stage, now = self.stage, self.stage.now
                 stop = self._next_report(total)
                 state, info = self._iterated(now.state, stage.step, stop)
                 if self._thins_out:
-                    moving = np.flatnonzero(self._moving(state))
+                    moving = np.flatnonzero(self.policy.moving(state))
                     if len(moving) <= self.few * self.chains:
                         state, info = self._go_on(state, info, moving, stop, total)
                         stop = total
@@ -748,43 +626,19 @@ class Search:
             died_at = on_host(now.state.died_at, self.mesh)
             require_alive(self.flow, self.family.at(0), replace(knots, slack=None), died_at)
 
-    def _waits(self, now: Chains) -> bool:
-        """Whether to go on with an attempt; see `AttemptSoFar`.
+    def _waits(self) -> bool:
+        """Whether to go on with an attempt; see `Policy.waits`.
 
-        Where a finish will follow, what is left of an attempt is polished there. Else all that
-        matters is waited for, but for a share `STRAGGLERS`. It depends on the chains alone, and is
-        asked at the usual reports only, so solves that are resumed or recorded end where others do.
-        A batch is not asked: answers would depend on what else is in it.
+        It depends on the chains alone, and is asked at the usual reports only, so solves that are
+        resumed or recorded end where others do. A batch is not asked: answers would depend on what
+        else is in it.
         """
-        stage, settings = self.stage, self.settings
-        usual = self._usual_report(self.flow.iterations + settings.after)
-        polished = self.polish is not None and stage.step > self.flow.iterations
+        stage, noisy = self.stage, self.flow.iterations
+        usual = self._usual_report(noisy + self.settings.after)
+        polished = self.policy.polish is not None and stage.step > noisy
         if not (polished and self.family.alone and stage.step % usual == 0):
             return True
-        if stage.finishing:
-            return bool(self._unfinished(now).any())
-        active = self._moving(now.state)
-        if stage.attempt + 1 < settings.attempts or (self._ends_early and stage.attempt > 0):
-            bar, floor = self._done_up_to(self.indices, now).item(), stage.floor[0]
-            count = wanted(self.chains, len(active))
-            if stage.kept is not None:
-                count = int((stage.kept.sound_cost - floor > bar).sum())
-            assert settings.done_share is not None
-            so_far = AttemptSoFar(
-                active=active,
-                cost=now.sound_cost - floor,
-                before=stage.before - floor,
-                bar=bar,
-                wanted=count,
-                needless=(1.0 - settings.done_share) * max(self.chains, count),
-                iterations=stage.step,
-                since=usual,
-                wider=self.places(stage.attempt + 1) / len(active),
-            )
-            if self._ends_early and so_far.over:
-                return False
-            active = so_far.waited_for
-        return bool(active.sum() > STRAGGLERS * len(active))
+        return self.policy.waits(stage, self.indices, usual, self.places(stage.attempt + 1))
 
     def _usual_report(self, total: int) -> int:
         """Iterations between two reports of an attempt of so many."""
@@ -855,113 +709,48 @@ class Search:
                     least = np.minimum(least, costs.min())
                 self.stage = replace(stage, now=replace(stage.now, missed=now.missed), least=least)
             return True
-        now = self._whole(stage.now)
-        better = np.zeros(len(now.missed), bool)
+        now, fresh = self._whole(stage.now), True
         if self.guess is not None and stage.attempt == stage.rollouts == 0:
             # The attempt may have lost contacts of the guess: rollouts then start from the guess
-            everyone = np.arange(len(better))
+            everyone = np.arange(len(now.missed))
             guessed = self._replayer.rolled_out(self._guessed(), everyone, 0.0, stage.done)
             now, better = self._no_worse(now, guessed)
-        damping, count = stage.damping, stage.rollouts
-        if count == 0 and not better.any():
-            # Where all chains of a problem are sound, rounds are for what random shooting changes
-            sound = now.feasible & ~self._replayer.missed(now)
-            whole = sound.reshape(len(self.indices), -1).all(axis=1)
-            damping = np.where(np.repeat(whole, len(sound) // len(whole)), np.inf, damping)
-            if whole.all():
-                count = self._without_more_rounds(now)
-            if count == rollouts.total:
-                return True
+            fresh = not better.any()
         try:
-            self.stage = replace(stage, now=now, damping=damping, rollouts=count)
+            begun = rounds.begun(replace(stage, now=now), rollouts, self._replayer, fresh)
+            if begun.rollouts == rollouts.total:
+                return True
+            self.stage = begun
             while self.stage.rollouts < rollouts.total:
                 if self.stage.rollouts < rollouts.first:
-                    self._next_rollout()
+                    self.stage = rounds.rolled_out(self.stage, self._replayer)
                 elif self.stage.rollouts == rollouts.shoot_at:
-                    self._shoot()
+                    self._shoot(rollouts)
                 else:
-                    self._next_round()
+                    done = self.stage.done + rollouts.iterations
+                    again = partial(self._again_with, iterations=rollouts.iterations)
+                    after = rounds.after_round(self.stage, rollouts, self._replayer, again)
+                    self._report(after, done)
         except KeyboardInterrupt:
             return False
         return True
 
-    def _without_more_rounds(self, now: Chains) -> int:
-        """Where `Stage.rollouts` goes on if rounds change nothing: random shooting, or the end."""
-        rollouts = self.settings.rollouts
-        assert rollouts is not None
-        shoots = self.stage.rollouts <= rollouts.shoot_at and self._unsure(now).any()
-        return rollouts.shoot_at if shoots else rollouts.total
+    def _shoot(self, rollouts: Rollouts) -> None:
+        """Random shooting; what it has found is kept where it is interrupted."""
 
-    def _unsure(self, now: Chains) -> np.ndarray:
-        """Which chains random shooting may help, (rows,): those that are not sound.
+        def tell(stage: Stage) -> None:
+            self._tell(stage, stage.done)
 
-        Without a goal all of them: a motion that touches nothing may be sound, and worth nothing.
-        """
-        return ~now.sound | (self.family.problem.goal is None)
-
-    def _shoot(self) -> None:
-        """Random shooting, from where they are, by chains that it may help."""
-        stage, rollouts, replayer = self.stage, self.settings.rollouts, self._replayer
-        assert rollouts is not None
-        now, damping, ended = stage.now, stage.damping, True
-        rows = np.flatnonzero(self._unsure(now))
-        if len(rows):
-            knots = replace(now.state.trajectory, slack=None)
-            box = box_of_controls(*reversed(self.question), knots)
-            keys = np.stack([replayer.of[rows], rows % replayer.places], axis=1)
-
-            def told(shots: Shots) -> None:
-                cost, worst = np.array(now.info.cost), np.array(now.info.max_defect)
-                cost[rows], worst[rows] = shots.cost, shots.broken
-                info = replace(now.info, cost=jnp.asarray(cost), max_defect=jnp.asarray(worst))
-                self._tell(replace(stage, now=replace(now, info=info)), stage.done)
-
-            shots, ended = shoot(
-                lambda some, controls: replayer.fired(knots, rows[some], controls),
-                np.asarray(knots.u)[rows],
-                [np.asarray(end, float)[rows] for end in box],
-                replayer.floor[rows],
-                [(self.seed, stage.attempt, *key) for key in keys.tolist()],
-                (rollouts.samples, rollouts.generations),
-                told,
-            )
-            found = replayer.taken(now, rows, shots, stage.done)
-            before, now = now, best_of(now, found, np.arange(len(now.missed)))
-            damping = np.where(_same(before, now), damping, 1.0)
-        count = stage.rollouts + 1 if np.isfinite(damping).any() else rollouts.total
-        self.stage = replace(stage, now=now, damping=damping, rollouts=count)
+        self.stage, ended = rounds.shot(self.stage, rollouts, self._replayer, self.seed, tell)
         if not ended:
             raise KeyboardInterrupt
 
-    def _next_rollout(self) -> None:
-        """A rollout without feedback, later ones with it."""
-        stage = self.stage
-        rows, with_feedback = np.flatnonzero(np.isfinite(stage.damping)), float(stage.rollouts > 0)
-        now = self._replayer.rolled_out(stage.now, rows, with_feedback, stage.done)
-        self.stage = replace(stage, now=now, rollouts=stage.rollouts + 1)
-
-    def _next_round(self) -> None:
-        """A round: iterations, and the rollouts of what they have changed."""
-        stage, everyone = self.stage, np.arange(len(self.stage.now.missed))
-        rollouts = self.settings.rollouts
-        assert rollouts is not None
-        now, damping, count = stage.now, stage.damping, stage.rollouts + 1
-        iterations = rollouts.iterations
-        done, end = stage.done + iterations, self.flow.iterations + self.settings.after
-        # Chains that the largest damping has left as they were would come to the same again
-        rows, most = np.flatnonzero(np.isfinite(damping)), DAMPING_RANGE[1]
-        finite = jnp.asarray(np.minimum(damping, most), now.state.damping.dtype)
-        state, info = self._iterated(replace(now.state, damping=finite), end - iterations, end)
-        missed = np.ones(len(everyone), bool)  # until it is shown
-        found = self._whole(Chains(state, info, np.full(len(everyone), done), missed))
-        found, better = self._replayer.rolled_out_in_part(now, found, rows, done)
-        before, now = now, best_of(now, found, everyone)
-        factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))
-        settled = _same(before, now) & (better == 0.0) & (damping >= most)
-        damping = np.where(settled, np.inf, np.clip(damping * factor, *DAMPING_RANGE))
-        if not better.any() and (damping >= most).all():
-            count = self._without_more_rounds(now)
-        self._report(replace(stage, now=now, damping=damping, rollouts=count), done)
+    def _again_with(self, damping: np.ndarray, iterations: int) -> Chains:
+        """The chunk's chains after the last iterations of an attempt again, damped so (rows,)."""
+        state, end = self.stage.now.state, self.flow.iterations + self.settings.after
+        damped = replace(state, damping=jnp.asarray(damping, state.damping.dtype))
+        state, info = self._iterated(damped, end - iterations, end)
+        return self._whole(Chains.of(state, info, self.stage.now.feasible_since))
 
     # Reports, recordings, checkpoints
 
@@ -1017,7 +806,7 @@ class Search:
         nx, nu, dtype = problem.dynamics.nx, problem.dynamics.nu, problem.x_init.dtype
         ones = Scale(np.ones(self.size), np.ones(self.size))
         none = np.zeros(self.size, int)
-        shared, own = family.question(settings.flow, ones, none, self.chains, self.polish)
+        shared, own = family.question(settings.flow, ones, none, self.chains, self.policy.polish)
 
         def state() -> State:
             x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))
@@ -1027,8 +816,8 @@ class Search:
             return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
         whole, kept = jax.eval_shape(state), family.count * self.chains / rows
-        rounds = settings.rollouts.rounds if settings.rollouts else 0
-        reports = settings.attempts * (100 + rounds) if family.alone else 1
+        more = settings.rollouts.rounds if settings.rollouts else 0
+        reports = settings.attempts * (100 + more) if family.alone else 1
         recording = 0
         if recorder is not None:
             reports += settings.iterations // recorder.every
@@ -1089,31 +878,3 @@ class Search:
         if self.checkpoint is not None:
             solve_time = time.perf_counter() - self.clock
             self.checkpoint.save(lambda: self._saved(solve_time, ended), now)
-
-
-def _same(before: Chains, now: Chains) -> np.ndarray:
-    """Which chains nothing better was found for, (rows,)."""
-    of_both = (np.stack([a.cost, a.info.max_defect]) for a in (before, now))
-    return np.equal(*of_both).all(axis=0)
-
-
-@partial(jax.jit, static_argnames=("chains", "guess"))
-def _drawn_by_row(
-    own: Problem, shared: Problem, keys: Array, chains: int, guess: Any
-) -> tuple[Trajectory, Array]:
-    """Initial knots of every chain of every problem, and their keys, in one axis of rows."""
-
-    def of_problem(own: Problem, key: Array) -> tuple[Trajectory, Array]:
-        problem = replace(joined(shared, own), guess=guess)
-        knots = initial_knots(problem, chains, None, jax.random.fold_in(key, 0))
-        return knots, chain_keys(jax.random.fold_in(key, 1), chains)
-
-    both = jax.vmap(of_problem)(own, keys)
-    rows: tuple[Trajectory, Array] = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), both)
-    return rows
-
-
-@jax.jit
-def _keys_of(key: Array, indices: Array) -> Array:
-    """The key of each problem, whatever is solved beside it."""
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)

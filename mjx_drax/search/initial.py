@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,6 +15,7 @@ from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.base.numbers import numbers
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.search.iterate import chain_keys, joined
 
 
 def initial_knots(
@@ -50,6 +53,28 @@ def initial_knots(
         knots.append(jnp.asarray(np.broadcast_to(array, (chains, K, size))))
     start = _start(problem, guess.start, chains)
     return problem.started(Trajectory(knots[0], knots[1], start=start))
+
+
+@partial(jax.jit, static_argnames=("chains", "guess"))
+def knots_by_row(
+    own: Problem, shared: Problem, keys: Array, chains: int, guess: Any
+) -> tuple[Trajectory, Array]:
+    """Initial knots of every chain of every problem, and their keys, in one axis of rows."""
+
+    def of_problem(own: Problem, key: Array) -> tuple[Trajectory, Array]:
+        problem = replace(joined(shared, own), guess=guess)
+        knots = initial_knots(problem, chains, None, jax.random.fold_in(key, 0))
+        return knots, chain_keys(jax.random.fold_in(key, 1), chains)
+
+    both = jax.vmap(of_problem)(own, keys)
+    rows: tuple[Trajectory, Array] = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), both)
+    return rows
+
+
+@jax.jit
+def problem_keys(key: Array, indices: Array) -> Array:
+    """The key of each problem, whatever is solved beside it."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
 
 
 def _start(problem: Problem, given: Any, chains: int) -> Array | None:
