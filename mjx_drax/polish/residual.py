@@ -9,11 +9,12 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
     complementarity     v slack = 0       summed over all bounds, relative to the cost
 
 and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
-from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn
-from. The cost is measured by what its slope promises over the motion, sum |dc/du| |u| and a share
-of sum |dc/dx| |x|. So neither units nor constants that are added to it change the residual. Where
-the cost has neither slope nor curvature, as one that is constant, lambda = 0 and v = 0 are right,
-whatever they are here: every motion that breaks nothing is an optimum.
+from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn from,
+or 0.01 where that has no width. The cost is measured by what its slope promises over the motion,
+sum |dc/du| |u| and a share of sum |dc/dx| |x|. So neither units nor constants that are added to it
+change the residual. Where the cost has neither slope nor curvature, as one that is constant,
+lambda = 0 and v = 0 are right, whatever they are here: every motion that breaks nothing is an
+optimum.
 """
 
 from __future__ import annotations
@@ -105,9 +106,8 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     sizes = slope_of(jax.tree.map(jnp.abs, derivatives), absolute, knots, model.start, 1.0)
     sizes = jax.tree.map(lambda s, a, b: s + a + b, sizes, below, above)
 
-    box, offset = problem.scatter, jax.vmap(problem.dynamics.difference, (0, None))
-    x = _moves(tangent(box.x_upper - box.x_lower), offset(knots.x, problem.x_init))
-    u = _moves(box.u_upper - box.u_lower, knots.u)
+    offset, (of_x, of_u) = jax.vmap(problem.dynamics.difference, (0, None)), problem.widths
+    x, u = _moves(of_x, offset(knots.x, problem.x_init)), _moves(of_u, knots.u)
     tiny = jnp.finfo(u.dtype).tiny
     curved = [
         jnp.abs(jnp.einsum("kii->ki", H)) for H in (derivatives.cost.Hxx, derivatives.cost.Huu)
@@ -203,8 +203,9 @@ def slacks_of(problem: Problem, knots: Trajectory) -> Sides:
 
 
 def _moves(width: Array, offsets: Array) -> Array:
-    """How far each coordinate moves, given the width of the box of initial knots."""
-    floor = jnp.where(jnp.isfinite(width), jnp.abs(width), 0.0)
-    floor = REST * (floor if floor.ndim == 1 else floor.max(axis=0))
-    moves = jnp.maximum(jnp.abs(offsets).max(axis=0, initial=0.0), floor)
-    return jnp.where(moves > 0.0, moves, 1.0)
+    """How far each coordinate moves, given the width of the box of initial knots.
+
+    Where it has none, as rotations, it is 1: a ball joint may not turn about one of its axes.
+    """
+    floor = REST * jnp.where(width > 0.0, width, 1.0)
+    return jnp.maximum(jnp.abs(offsets).max(axis=0, initial=0.0), floor)

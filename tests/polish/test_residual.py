@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_drax import LogBarrier, Trajectory, from_function, from_program
+from mjx_drax import LogBarrier, Trajectory, from_function, from_mjcf, from_program, solve
 from mjx_drax.method.model import Multipliers, expand
 from mjx_drax.method.schedules import Weights
 from mjx_drax.polish.residual import residual_of
@@ -188,3 +188,37 @@ def test_complementarity_is_a_part_of_its_own():
     assert sizes[1] == pytest.approx(100 * sizes[0], rel=0.05)
     assert nearest([1.2, 0.8], 0.0, 0.3, 0.6)[0] > 1e-2  # forces that do not balance
     assert nearest([1.2, 0.9], 0.0, 0.1, 0.7)[2] > 1e-2  # too far
+
+
+def test_rounding_is_no_motion_where_a_coordinate_has_no_box():
+    problem = from_function(
+        lambda x, u: x + jnp.array([1.0, 0.0]) * u,
+        x_init=[0.0, 0.0],
+        nu=1,
+        dt=1.0,
+        horizon=float(K),
+        running_residual=lambda x, u: u,
+        x_scatter=(0.0, 0.0),
+    )
+    x = np.zeros((K, NX))
+    x[0, 1] = 1e-9  # which comes back in the next step
+    knots = Trajectory(jnp.asarray(x), jnp.zeros((K, 1)))
+    none = Stagewise(jnp.zeros((K, 0)), jnp.zeros(0))
+    nothing = jax.tree.map(jnp.zeros_like, knots)
+    found = parts_of(problem, knots, Multipliers(jnp.zeros((K, NX)), none), (nothing, nothing))
+    np.testing.assert_allclose(found[1], 1e-9 / 0.01)
+
+
+@pytest.mark.slow
+def test_a_ball_joint_need_not_turn_about_its_axis():
+    problem = from_mjcf(
+        """<mujoco><option timestep="0.02"/><worldbody><body><joint name="b" type="ball"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" contype="0" conaffinity="0"/>
+        <site name="tip" pos="0 0 -0.4"/></body></worldbody><actuator>
+        <motor joint="b" gear="1 0 0"/><motor joint="b" gear="0 1 0"/></actuator></mujoco>""",
+        horizon=1.0,
+        running_residual=lambda data, u: 0.1 * u,
+        terminal_residual=lambda data: 10 * (data.site("tip").xpos - jnp.array([0.2, 0.1, -0.33])),
+    )
+    solution = solve(problem, chains=4, seed=0, progress=False)
+    assert solution.optimal_chains.all()
