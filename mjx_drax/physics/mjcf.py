@@ -176,7 +176,7 @@ def from_mjcf(
         )
     K, dt = of_phases(phases) if phases else (knots_in(horizon, dt), dt)
     x0, bounded = checked_start(mj_model, name, x_init, stops)
-    contacts = affordable(mj_model, name, x0, bounded, contacts)
+    contacts, left_out = affordable(mj_model, name, x0, bounded, contacts)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
     require_traceable(mj_model, name, dynamics.observe)
@@ -187,7 +187,7 @@ def from_mjcf(
     found = examine(mj_model, name, x0, contacts, bounded, kept_contacts(planned))
     if found.obstacle:
         raise DraxError(found.obstacle)
-    for note in found.notes:
+    for note in (left_out, *found.notes) if left_out else found.notes:
         warnings.warn(note, DraxWarning, stacklevel=2)
     scatter = _scatter(dynamics, bounds, x0, x_scatter, u_scatter)
     near = 0.5 if x_scatter is None else 0.0

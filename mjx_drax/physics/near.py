@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.agreement.checks import samples
 from mjx_drax.physics.c_engine.states import Engine, quiet, set_state
 from mjx_drax.physics.contacts.collision import corners
@@ -26,20 +23,18 @@ at."""
 
 def affordable(
     model: mujoco.MjModel, name: str, x_init: np.ndarray, bounded: np.ndarray, contacts: Contacts
-) -> Contacts:
+) -> tuple[Contacts, str | None]:
     """`contacts`; or, for True and a model that has too many, pairs that come close near x_init.
 
-    Pairs are kept from the nearest on, where `MOST_WORK` allows.
-
-    Warns:
-        DraxWarning: what is left out.
+    Pairs are kept from the nearest on, where `MOST_WORK` allows. Also a sentence about what is left
+    out, None if nothing is.
     """
     if contacts is not True:
-        return contacts
+        return contacts, None
     every = list(contact_pairs(model))
     work = [_work(model, *pair) for pair in every]
     if sum(work) <= MOST_WORK:
-        return True
+        return True, None
     distance = _least_distances(model, every, x_init, bounded)
     kept: list[Pair] = []
     spent = 0.0
@@ -49,14 +44,12 @@ def affordable(
             kept.append(every[i])
     first = next(pair for pair in every if pair not in kept)
     names = " with ".join(repr(geom_name(model, g)) for g in first)
-    warnings.warn(
+    note = (
         f"{name} has {len(every)} pairs of geoms that may touch, and too many corners of meshes: "
         f"the plan has contacts of {len(kept)} that come closest in motions from x_init, and of no "
-        f'other, such as {names}. Choose them by contacts=[("foot_*", "floor"), ...].',
-        DraxWarning,
-        stacklevel=3,
+        f'other, such as {names}. Choose them by contacts=[("foot_*", "floor"), ...].'
     )
-    return sorted(kept)
+    return sorted(kept), note
 
 
 def _work(model: mujoco.MjModel, a: int, b: int) -> int:

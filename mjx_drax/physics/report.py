@@ -83,7 +83,8 @@ def check(
     try:
         x_init, bounded = checked_start(model, name)
         report["joints"] = _joints(model, bounded)
-        contacts = affordable(model, name, x_init, bounded, contacts)
+        contacts, left_out = affordable(model, name, x_init, bounded, contacts)
+        report["notes"] = [left_out] if left_out else []
         report["differences"] = [each.sentence for each in differences(model, contacts)]
         planned = put_model(model, contacts, bounded)
         report["sizes"]["constraint_rows"] = constraint_rows(planned)
@@ -97,7 +98,8 @@ def check(
         require_traceable(model, name, dynamics.observe)
         kept = kept_contacts(planned)
         found = examine(model, name, x_init, contacts, bounded, kept, derivatives=True)
-        report["agreement"], report["notes"] = _agreement(found), list(found.notes)
+        report["agreement"] = _agreement(found)
+        report["notes"] += found.notes
         report["obstacle"] = found.obstacle
     except DraxError as error:
         report["obstacle"] = str(error)

@@ -26,6 +26,9 @@ _FIXES = {
 }
 """What to do about some of MuJoCo's error messages."""
 
+_PACKAGE = "package://"
+"""How names of meshes begin in a URDF for ROS."""
+
 _GIVEN = ("body_", "dof_", "jnt_", "geom_", "tendon_", "actuator_", "eq_", "qpos_spring", "key_")
 """How the names of arrays begin that hold what the MJCF says; names ending in 0 are computed."""
 
@@ -63,9 +66,9 @@ def load(source: str | Path | mujoco.MjModel, actuators: Actuators | None = None
 def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel:
     try:
         with quiet():
-            if actuators is not None and (is_xml(source) or Path(source).is_file()):
-                return _spec(source, actuators).compile()
             if is_xml(source):
+                if actuators is not None:
+                    return _spec(source, actuators).compile()
                 return mujoco.MjModel.from_xml_string(source)
             if not Path(source).is_file():
                 is_folder = source != "" and Path(source).is_dir()
@@ -73,6 +76,8 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
                 raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
             if is_binary(source):
                 return mujoco.MjModel.from_binary_path(str(source))
+            if actuators is not None or _found_meshes(Path(source)):
+                return _spec(source, actuators).compile()
             return mujoco.MjModel.from_xml_path(str(Path(source).absolute()))
     except DraxError:
         raise
@@ -81,7 +86,7 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
             f"the model is {shown(source)}: give an MJCF file, its XML as a text, or a "
             "mujoco.MjModel."
         ) from error
-    except (ValueError, OSError, mujoco.FatalError) as error:
+    except (ValueError, OSError, ElementTree.ParseError, mujoco.FatalError) as error:
         words = " ".join(str(error).split())
         usual = "Compile it again, with this MuJoCo." if is_binary(source) else "Correct the MJCF."
         fix = next((fix for part, fix in _FIXES.items() if part in words), usual)
@@ -94,11 +99,57 @@ def _spec(source: str | Path, actuators: Actuators | None) -> mujoco.MjSpec:
     """What MuJoCo compiles, of a file or an XML string."""
     if is_xml(source):
         spec = mujoco.MjSpec.from_string(source)
+    elif (urdf := _found_meshes(Path(source))) is not None:
+        spec = mujoco.MjSpec.from_string(urdf)
     else:  # absolute, as in `_compiled`: a model holds paths of models that it attaches
         spec = mujoco.MjSpec.from_file(str(Path(source).absolute()))
     if actuators is not None:
         add_motors(spec, actuators, spec.modelname)
     return spec
+
+
+def _found_meshes(path: Path) -> str | None:
+    """A URDF whose meshes are named by their packages, with the files' paths; None of other files.
+
+    ROS knows where packages are. Here a package is a folder of that name above the URDF, or beside
+    one that is above it. Meshes that are only seen may be missing: MuJoCo leaves them out.
+
+    Raises:
+        DraxError: a file is not there.
+    """
+    text = path.read_bytes()
+    if _PACKAGE.encode() not in text:
+        return None
+    root = ElementTree.fromstring(text)
+    if root.tag != "robot":
+        return None
+    above = path.absolute().parents
+    seen = {mesh for visual in root.iter("visual") for mesh in visual.iter("mesh")}
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename", "")
+        if name.startswith(_PACKAGE):
+            places = [folder / name[len(_PACKAGE) :] for folder in above]
+            fix = "put the URDF into its package, or correct the name"
+        else:
+            places = [above[0] / name.removeprefix("file://"), above[0] / Path(name).name]
+            fix = "put that file there, or correct the name"
+        found = next((place for place in places if place.is_file()), None)
+        if found is None and mesh in seen:
+            continue
+        if found is None:
+            raise DraxError(
+                f"the URDF {shown(str(path))} names the mesh {shown(name)}, which is not "
+                f"{'in a folder above it' if name.startswith(_PACKAGE) else 'there'}: {fix}."
+            )
+        mesh.set("filename", str(found))
+    extension = root.find("mujoco")
+    if extension is None:
+        extension = ElementTree.SubElement(root, "mujoco")
+    compiler = extension.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(extension, "compiler")
+    compiler.set("strippath", "false")
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _require_finite(model: mujoco.MjModel) -> None:

@@ -1,5 +1,6 @@
 """Bad models, and bad arguments and functions of `from_mjcf`, give one clear error."""
 
+import re
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from builders import BALL, INF, NAN, At, arm, assert_complains, cases, robot
 
 from mjx_drax import Smoothed, from_mjcf, solve
 from mjx_drax.physics.agreement import checks
+from mjx_drax.physics.c_engine.states import Engine
 from mjx_drax.physics.contacts.pairs import left_out
 from mjx_drax.physics.report import check
 
@@ -24,6 +26,11 @@ ROPE = (
     '<flexcomp name="rope" type="grid" count="3 1 1" dim="1" spacing=".1 .1 .1" mass="1"/>'
     "</worldbody>"
 )
+PLUGIN = """<mujoco model="spun"><extension><plugin plugin="mujoco.pid"><instance name="p">
+  <config key="kp" value="40"/></instance></plugin></extension>
+  <worldbody><body><joint name="elbow"/><geom size="0.1"/></body></worldbody>
+  <actuator><plugin name="servo" joint="elbow" plugin="mujoco.pid" instance="p" actdim="0"/>
+  </actuator></mujoco>"""
 CROSSED = '<motor joint="elbow" ctrlrange="1 -1" ctrllimited="true"/>'
 STILL = "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"
 
@@ -37,6 +44,7 @@ MODELS = [
     ("too-few-numbers", lambda at: robot(arm(joint='pos="1 2"')), "pos"),
     ("no-such-joint", lambda at: robot(arm(actuator='<motor joint="knee"/>')), "knee"),
     ("repeated-name", lambda at: robot(arm('<body name="link"/>')), "repeated name", "link"),
+    ("plugin", lambda at: robot(PLUGIN), "actuators of spun are plugins (servo)", "<position>"),
     ("crossed-range", lambda at: robot(arm(actuator=CROSSED)), "range"),
     ("massless", lambda at: robot("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>"),
      "mass", "<inertial>"),
@@ -163,5 +171,37 @@ def test_a_cause_is_looked_for_with_pairs_of_contacts_that_are_named(monkeypatch
         return SimpleNamespace(velocity=np.ones(1))
 
     monkeypatch.setattr(checks, "compare", compare)
-    cause = checks.causes(model, None, [("ball", "floor")], np.zeros(0), 1.0)
+    at = checks.Samples(np.array([[0.0, 0, 1, 1, 0, 0, 0, *np.zeros(6)]]), np.zeros((1, 0)))
+    errors = checks.StepErrors(np.ones(1))
+    cause = checks.causes(Engine(model), at, [("ball", "floor")], np.zeros(0), errors)
     assert cause == "the reason is not known"
+
+
+@pytest.mark.parametrize(
+    ("margin", "words"),
+    [(0.0, "that of 'drum' with 'table' differ: .* choose contacts"), (0.01, "not at a margin")],
+)
+def test_a_cause_is_of_contacts_that_act(margin, words, monkeypatch):
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1'/></asset><worldbody>
+        <geom name='never' type='ellipsoid' size='.1 .1 .2' pos='0 0 -9'/>
+        <geom name='table' type='box' size='1 1 .1' margin='{margin}'/>
+        <body pos='0 0 {0.105 if margin else 0.19}'><freejoint/>
+          <geom name='drum' type='{"mesh' mesh='m" if margin else "cylinder' size='.1 .1"}'/></body>
+        </worldbody></mujoco>"""
+    )
+
+    def compare(changed, at, contacts, bounded):
+        gone = changed.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+        if margin:
+            gone = not changed.geom_margin.any()
+        return SimpleNamespace(velocity=np.ones(1) * (not gone))
+
+    monkeypatch.setattr(checks, "compare", compare)
+    x = np.array([[*model.qpos0, *np.zeros(6)]])
+    errors = checks.StepErrors(np.ones(1))
+    cause = checks.causes(
+        Engine(model), checks.Samples(x, np.zeros((1, 0))), True, np.zeros(0), errors
+    )
+    assert re.search(words, cause), cause
+    assert "never" not in cause

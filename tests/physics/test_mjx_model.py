@@ -543,10 +543,17 @@ def test_contact_solvers_converge_and_options_that_stop_them_are_told():
     assert ["stop early (iterations=1, ls_iterations=1" in note for note in found.notes] == [True]
 
 
-def test_a_timestep_at_which_the_c_engine_diverges_is_refused():
+@pytest.mark.parametrize(
+    ("stiffness", "fix"),
+    [
+        (1e4, r"make its timestep of 0\.02 s ten times smaller\."),
+        (1e9, "make stiff springs and servos softer"),  # a tenth diverges too
+    ],
+)
+def test_a_timestep_at_which_the_c_engine_diverges_is_refused(stiffness, fix):
     stiff = rigid(joint='springref="1"')
-    stiff.jnt_stiffness[0], stiff.opt.timestep = 1e4, 0.02
-    with pytest.raises(DraxError, match=r"diverges .* tenth of its timestep of 0\.02 s"):
+    stiff.jnt_stiffness[0], stiff.opt.timestep = stiffness, 0.02
+    with pytest.raises(DraxError, match=f"diverges in MuJoCo's C engine .*: {fix}"):
         examine(stiff, "chain", STATES.x[0], True, np.zeros(2, bool), None)
 
 

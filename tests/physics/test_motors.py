@@ -159,3 +159,29 @@ def test_a_urdf_gives_its_efforts():
     joint += '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="5" velocity="1"/></joint>'
     urdf = f'<robot name="r">{link.format("a")}{link.format("b")}{joint}</robot>'
     assert limits(load(urdf, "torque")) == [[-5, 5]]
+
+
+URDF = """<robot name="arm"><link name="base"/><link name="tip">
+  <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+  <visual><geometry><mesh filename="package://arm/meshes/only_seen.dae"/></geometry></visual>
+  <collision><geometry><mesh filename="package://arm/meshes/{mesh}.obj"/></geometry></collision>
+  </link><joint name="turn" type="revolute"><parent link="base"/><child link="tip"/>
+  <limit lower="-2" upper="2" effort="10" velocity="5"/></joint></robot>"""
+
+
+def test_meshes_are_found_in_the_package_of_a_urdf(tmp_path):
+    for folder in ("urdf", "meshes"):
+        (tmp_path / "arm" / folder).mkdir(parents=True)
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "arm" / "meshes" / "tip.obj").write_text(corners)
+    file = tmp_path / "arm" / "urdf" / "arm.urdf"
+    file.write_text(URDF.format(mesh="tip"))
+    for actuators, nu in ((None, 0), ("torque", 1)):
+        model = load(file, actuators)
+        assert (model.nmesh, model.nu) == (1, nu)
+        # which can be saved, and read elsewhere
+        again = Source.of(file, model, actuators).compiled()
+        np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
+    file.write_text(URDF.format(mesh="lost"))
+    with pytest.raises(DraxError, match=r"lost\.obj', which is not in a folder above it: put the"):
+        load(file)

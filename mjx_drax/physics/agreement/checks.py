@@ -103,6 +103,13 @@ def _require_movable(model: mujoco.MjModel, name: str) -> None:
             f'{name} has no actuators: give actuators="torque" or {{"position": kp}}, or add an '
             "<actuator>."
         )
+    plugins = np.flatnonzero(model.actuator_plugin >= 0)
+    if plugins.size:
+        names = ", ".join(str(model.actuator(a).name or a) for a in plugins.tolist())
+        raise DraxError(
+            f"actuators of {name} are plugins ({names}), which MJX does not compute: use <motor>, "
+            "<position> or <general> for them."
+        )
     if disabled(model).all():
         raise DraxError(
             f"all actuators of {name} are disabled: clear the flag actuation and "
@@ -233,21 +240,28 @@ def _require_stable(engine: Engine, name: str, x_init: np.ndarray) -> None:
     """Complain about a timestep at which the C engine itself diverges from x_init (nx,).
 
     Raises:
-        DraxError: it does so under a constant control, and not with a tenth of the timestep.
+        DraxError: it does so under a constant control.
     """
     timestep, u = engine.model.opt.timestep, np.clip(0.0, *control_ranges(engine.model))
     steps = max(1, round(MOMENTS[-1] / timestep))
     if np.isfinite(engine.step(x_init, u, steps)).all():
         return
-    engine.model.opt.timestep = timestep / 10
-    finer = engine.step(x_init, u, 10 * steps)
-    engine.model.opt.timestep = timestep
-    if np.isfinite(finer).all():
-        raise DraxError(
-            f"{name} diverges in MuJoCo's C engine within {MOMENTS[-1]} s from x_init at control "
-            f"{shown(u.tolist())}, and does not with a tenth of its timestep of {timestep:g} s: "
-            'make it smaller, or set <option integrator="implicitfast"/>.'
+    finer, calmer = copy.deepcopy(engine), copy.deepcopy(engine)
+    finer.model.opt.timestep = timestep / 10
+    calmer.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    helps = [
+        fix
+        for other, count, fix in (
+            (finer, 10 * steps, f"make its timestep of {timestep:g} s ten times smaller"),
+            (calmer, steps, 'set <option integrator="implicitfast"/>'),
         )
+        if np.isfinite(other.step(x_init, u, count)).all()
+    ]
+    fix = " or ".join(helps) or "make stiff springs and servos softer, or masses larger"
+    raise DraxError(
+        f"{name} diverges in MuJoCo's C engine within {MOMENTS[-1]} s from x_init at control "
+        f"{shown(u.tolist())}: {fix}."
+    )
 
 
 @dataclass(frozen=True)
@@ -443,13 +457,7 @@ def _examined(
         )
     obstacle = None
     if not error <= NOTICEABLE:
-        of_hulls = _where_hulls_touch(engine, at, errors)
-        cause = (
-            "hulls of meshes touch in all states where it does, and in none of the others; choose "
-            'contacts=[("foot_*", "floor"), ...] without them, or plan with contacts=False'
-            if of_hulls
-            else causes(model, at, contacts, bounded, error)
-        )
+        cause = causes(engine, at, contacts, bounded, errors)
         words = (
             f"one step of MJX differs from MuJoCo's C engine by {error:.1e} in the velocities of "
             f"{name}: {cause}."
@@ -472,14 +480,20 @@ def _where_hulls_touch(engine: Engine, at: Samples, errors: StepErrors) -> bool:
 
 
 def causes(
-    model: mujoco.MjModel,
+    engine: Engine,
     at: Samples,
     contacts: Contacts,
     bounded: np.ndarray,
-    error: float,
+    errors: StepErrors,
 ) -> str:
-    """Why the velocities of a step have an error, as far as comparing without a cause tells."""
+    """Why the velocities of a step have an error, as far as comparing without a cause tells.
+
+    Contacts are a cause only where they act in states that have the error.
+    """
+    model, error = engine.model, float(errors.velocity.max())
     kept = touching(model, contacts)
+    off = errors.velocity > max(NOTICEABLE, error / 10)
+    acting = {pair for x in at.x[off] for pair in engine.touching(x)}
 
     def error_without(*changes: Change) -> float:
         changed = copy.deepcopy(model)
@@ -490,7 +504,7 @@ def causes(
             rest = sorted(kept & set(contact_pairs(changed))) or False
         return float(compare(changed, at, rest, bounded).velocity.max())
 
-    known = differences(model, contacts)
+    known = differences(model, contacts, acting)
     if known:
         rest = error_without(*(each.without for each in known))
         if rest <= max(NOTICEABLE, error / 10):
@@ -506,6 +520,11 @@ def causes(
                 if not own <= max(2 * rest, NOTICEABLE)
             ]
             return "; ".join(named or [each.sentence for each in known])
+    if _where_hulls_touch(engine, at, errors):
+        return (
+            "hulls of meshes touch in all states where it does, and in none of the others; choose "
+            'contacts=[("foot_*", "floor"), ...] without them, or plan with contacts=False'
+        )
     for part, flag in PARTS.items():
         rest = error_without(disabling(flag))
         if rest <= max(NOTICEABLE, error / 10):

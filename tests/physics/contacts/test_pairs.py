@@ -1,13 +1,14 @@
 """Contacts that are chosen by names, and those that a plan has by default."""
 
 import json
+import re
 
 import jax
 import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError
+from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics import near
 from mjx_drax.physics.agreement.checks import Samples, compare, examine
@@ -15,6 +16,7 @@ from mjx_drax.physics.c_engine.states import Engine
 from mjx_drax.physics.contacts.pairs import contact_pairs, left_out
 from mjx_drax.physics.dynamics import MjxDynamics
 from mjx_drax.physics.mjx_model import contact_points, put_model
+from mjx_drax.physics.report import check
 
 XML = """
 <mujoco model="walker">
@@ -116,10 +118,13 @@ def test_geoms_that_just_touch_at_x_init_are_named(height, said):
 
 def test_of_too_many_contacts_the_nearest_are_kept(monkeypatch):
     model, x, none = walker(), np.zeros(4), np.zeros(2, bool)
-    assert near.affordable(model, "walker", x, none, True) is True
+    assert near.affordable(model, "walker", x, none, True) == (True, None)
     monkeypatch.setattr(near, "MOST_WORK", 8)
     monkeypatch.setattr(near, "EACH", 2)
-    with pytest.warns(DraxWarning, match="8 pairs .* 2 that come closest .* no other, such as"):
-        found = near.affordable(model, "walker", x, none, True)
+    found, note = near.affordable(model, "walker", x, none, True)
     assert found == [(0, 2), (0, 3)]
-    assert near.affordable(model, "walker", x, none, 3) == 3
+    assert re.search("8 pairs .* 2 that come closest .* no other, such as", note)
+    assert note in check(model)["notes"]
+    with pytest.warns(DraxWarning, match="8 pairs .* 2 that come closest"):
+        from_mjcf(model, horizon=0.1, running_cost=lambda data, u: u @ u)
+    assert near.affordable(model, "walker", x, none, 3) == (3, None)
