@@ -209,8 +209,8 @@ class Terms:
             raise not_computed(name)
         start, size = int(self.model.sensor_adr[sensor]), int(self.model.sensor_dim[sensor])
         wanted = _target(f"target of sensor {name!r}", target, size, alike=True)
-        where = ("sensordata", tuple(range(start, start + size)))
-        return self._term(_read, where, (wanted,), f"sensor {name!r}", size, weight)
+        where = (sensor, tuple(range(start, start + size)))
+        return self._term(_sensed, where, (wanted,), f"sensor {name!r}", size, weight)
 
     def site(
         self,
@@ -369,6 +369,14 @@ _QPOS = np.array([7, 4, 1, 1])  # numbers in the position of a free, ball, slide
 def _read(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
     name, at = where
     return getattr(data, name)[np.array(at)] - target
+
+
+def _sensed(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:
+    sensor, at = where
+    if not hasattr(data, "sensor"):  # plain `mjx.Data`
+        return _read(data, u, ("sensordata", at), target)
+    reading: Array = data.sensor(sensor).data - target
+    return reading
 
 
 def _control(data: Any, u: Array | None, where: tuple[Any, ...], target: Array) -> Array:

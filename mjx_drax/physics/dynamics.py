@@ -247,9 +247,9 @@ class MjxDynamics(Dynamics):
 
     def observe(self, x: Array, u: Array) -> Observed:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
-        data = _observe(self.model, self.structure, x, u)
+        data, readings = _observe(self.model, self.structure, x, u)
         data = data if self.time is None else data.replace(time=self.time)
-        return Observed.of(self.model, data)
+        return Observed.of(self.model, data, readings)
 
     @property
     def kinked(self) -> bool:  # type: ignore[override]
@@ -482,7 +482,9 @@ def mjx_dynamics(dynamics: Dynamics) -> MjxDynamics | None:
     return inner if isinstance(inner, MjxDynamics) else None
 
 
-def _observe(model: mjx.Model, structure: Structure, x: Array, u: Array) -> mjx.Data:
+def _observe(
+    model: mjx.Model, structure: Structure, x: Array, u: Array
+) -> tuple[mjx.Data, tuple[Array, ...]]:
     return one_step.forward(structure.fixed_in(model), x, u)
 
 

@@ -8,8 +8,6 @@ number. An element may also be given by its number. In `data.sensordata` what MJ
 is NaN.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -21,6 +19,7 @@ from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.physics._mjx import internal, mjx
 from mjx_drax.physics.joints import BALL, FREE
 from mjx_drax.physics.mjx_model import NOT_COMPUTED
+from mjx_drax.physics.step import kinds_of_sensors
 
 _OWN = {
     "body": ("xpos", "xquat", "xmat", "xipos", "ximat", "cvel", "subtree_com"),
@@ -50,18 +49,20 @@ class Names:
     Attributes:
         of: of each kind in the order of `_OWN`: the names of its elements, "" where it has none.
         sensors: (first, one after the last) entry in sensordata, of each sensor.
+        readings: of each sensor, which of `Observed.readings` has it.
         positions, velocities: the same in qpos and qvel, of each joint.
         unknown: sensors that MJX does not compute.
     """
 
     of: tuple[tuple[str, ...], ...]
     sensors: tuple[tuple[int, int], ...]
+    readings: tuple[int, ...]
     positions: tuple[tuple[int, int], ...]
     velocities: tuple[tuple[int, int], ...]
     unknown: tuple[int, ...]
 
     @classmethod
-    def in_model(cls, model: mjx.Model) -> Names:
+    def in_model(cls, model: mjx.Model) -> "Names":
         """The names in a model, which are static in it."""
         text = model.names
 
@@ -76,6 +77,7 @@ class Names:
         return cls(
             tuple(map(listed, _OWN)),
             spans(model.sensor_adr, model.sensor_dim),
+            tuple(map(kinds_of_sensors(model).index, model.sensor_type.tolist())),
             spans(model.jnt_qposadr, [q for q, _ in widths]),
             spans(model.jnt_dofadr, [v for _, v in widths]),
             tuple(np.flatnonzero(model.sensor_intprm[:, 0] == NOT_COMPUTED).tolist()),
@@ -102,7 +104,7 @@ class Element:
     `data.site("tip")` has xpos (3,) and xmat (9,); `dir()` of an element lists what it has.
     """
 
-    def __init__(self, data: Observed, kind: str, name: str | int) -> None:
+    def __init__(self, data: "Observed", kind: str, name: str | int) -> None:
         self._data, self._kind = data, kind
         self.id = data.names.index(kind, name)
         self.name = data.names.of[list(_OWN).index(kind)][self.id]
@@ -130,7 +132,7 @@ class Element:
         if name == "sensordata":
             if i in names.unknown:
                 raise not_computed(self.name)
-            return values[..., slice(*names.sensors[i])]
+            return self._data.readings[names.readings[i]][..., slice(*names.sensors[i])]
         if name.startswith("q"):
             return values[..., slice(*names.velocities[i])]
         if self._kind in ("actuator", "tendon"):
@@ -157,19 +159,26 @@ def _attribute(array: str) -> str:
 
 
 class Observed(mjx.Data):
-    """`mjx.Data` that knows the names of its model, as `mujoco.MjData` does."""
+    """`mjx.Data` that knows the names of its model, as `mujoco.MjData` does.
 
+    Attributes:
+        readings: `sensordata` with the sensors of one type alone, for each type, so that a cost
+            that reads one of them does not need the others.
+    """
+
+    # Annotations of this module are types, not texts: mjx asks which of them hold arrays
     names: Names
+    readings: tuple[Array, ...]
 
     @classmethod
-    def of(cls, model: mjx.Model, data: mjx.Data) -> Observed:
+    def of(cls, model: mjx.Model, data: mjx.Data, readings: tuple[Array, ...]) -> "Observed":
         """The data with the names of its model."""
         arrays = {field.name: getattr(data, field.name) for field in fields(data)}
         names = Names.in_model(model)
         for i in names.unknown:  # to MJX they are 0
             entries = slice(*names.sensors[i])
             arrays["sensordata"] = arrays["sensordata"].at[entries].set(jnp.nan)
-        return cls(**arrays, names=names)
+        return cls(**arrays, names=names, readings=readings)
 
     def body(self, name: str | int) -> Element:
         """A body: xpos (3,), xquat (4,), xmat (9,), xipos, ximat, cvel (6,), subtree_com (3,)."""

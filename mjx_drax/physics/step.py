@@ -77,14 +77,28 @@ def data_at(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
     return make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
 
 
-def forward(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
+def forward(model: mjx.Model, x: Array, u: Array) -> tuple[mjx.Data, tuple[Array, ...]]:
     """`mjx.forward`: all that follows from a state (nx,) and a control (nu,), up to accelerations.
 
-    Compiled functions compute only what their caller reads.
+    Also `sensordata` with the sensors of each of `kinds_of_sensors` alone: one array of all would
+    make compiled functions, which compute only what their caller reads, compute all of them.
     """
-    data = _smooth(model, kinematics(model, data_at(model, x, u)))
-    data = mjx.sensor_vel(model, mjx.sensor_pos(model, data))
-    return mjx.sensor_acc(model, _constrained(model, data))
+    data = _constrained(model, _smooth(model, kinematics(model, data_at(model, x, u))))
+    readings, every = [], data.sensordata
+    for kind in kinds_of_sensors(model):
+        mine = model.sensor_type == kind
+        only = model.replace(sensor_needstage=np.where(mine, model.sensor_needstage, -1))
+        found = mjx.sensor_vel(only, mjx.sensor_pos(only, data))
+        readings.append(mjx.sensor_acc(only, found).sensordata)
+        entries = np.repeat(mine, model.sensor_dim)
+        every = jnp.where(entries, readings[-1], every)
+    return data.replace(sensordata=every), tuple(readings)
+
+
+def kinds_of_sensors(model: mjx.Model) -> list[int]:
+    """The types of sensors that a model has, each once."""
+    kinds: list[int] = np.unique(model.sensor_type).tolist()
+    return kinds
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -524,5 +538,5 @@ def _runge_kutta(
     if model.na == 0:
         return moved
     # Activations are integrated as in MuJoCo's Euler step, with exact filters and their ranges
-    data = forward(model, x, u).replace(act_dot=total[2 * model.nv :])
+    data = forward(model, x, u)[0].replace(act_dot=total[2 * model.nv :])
     return moved.at[model.nq + model.nv :].set(mjx.euler(model, data).act)

@@ -28,7 +28,7 @@ from mjx_drax.physics.mjx_model import (
 )
 from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.report import check
-from mjx_drax.physics.step import data_at, forward, step
+from mjx_drax.physics.step import forward, step
 
 CHAIN = """
 <mujoco model="chain">
@@ -331,7 +331,7 @@ def test_a_cost_that_reads_an_unknown_sensor_is_refused():
         more='<sensor><user name="odd" dim="1"/><jointpos name="fine" joint="one"/></sensor>'
     )
     planned = put_model(model)
-    at = Observed.of(planned, data_at(planned, jnp.zeros(4), jnp.zeros(2)))
+    at = Observed.of(planned, *forward(planned, jnp.zeros(4), jnp.zeros(2)))
     assert at.sensor("fine").data.shape == (1,)
     with pytest.raises(DraxError, match="'odd' is of a kind that MJX does not compute"):
         _ = at.sensor("odd").data

@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import DraxError, from_mjcf
+from mjx_drax import DraxError, Terms, from_mjcf
+from mjx_drax.kernels.pruning import needed_program
 
 MODEL = """
 <mujoco model="toy"><option timestep="0.01"><flag contact="disable"/></option>
@@ -113,3 +114,20 @@ def test_knots_in_a_batch_are_read_along_the_last_axes():
 def test_wrong_names_list_those_that_there_are(read, words):
     with pytest.raises(DraxError, match=re.escape(words)):
         toy(terminal_residual=read)
+
+
+@pytest.mark.parametrize("read", ["by name", "as a term"])
+def test_a_cost_that_reads_a_sensor_does_not_compute_those_of_other_types(read):
+    def operations(model):
+        problem = from_mjcf(model, horizon=0.02, terminal_residual=lambda data: data.qvel)
+        angle = Terms(model).sensor("angle")
+
+        def cost(x):
+            data = problem.dynamics.observe(x, jnp.zeros(2))
+            return data.sensor("angle").data if read == "by name" else angle(data)
+
+        return str(needed_program(cost, (problem.x_init,))[0]).count("=")
+
+    without = MODEL.replace('<gyro name="rates" site="mark"/>', "")
+    more = MODEL.replace("<sensor>", '<sensor><framelinacc objtype="site" objname="tip"/>')
+    assert operations(more) <= operations(without) + 5
