@@ -6,6 +6,7 @@ import copy
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, Joints
 from mjx_drax.physics.mjx_model import Stops, free_ranges, kept_contacts, put_model
 from mjx_drax.physics.motors import Actuators
-from mjx_drax.physics.near import affordable
+from mjx_drax.physics.near import affordable, without_own
 from mjx_drax.physics.source import load, model_name, origin_of
 from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
 from mjx_drax.problem.choices import Choices, parameter_ends, phases_of
@@ -176,6 +177,7 @@ def from_mjcf(
         )
     K, dt = of_phases(phases) if phases else (knots_in(horizon, dt), dt)
     x0, bounded = checked_start(mj_model, name, x_init, stops)
+    by_default = contacts is True
     contacts, left_out = affordable(mj_model, name, x0, bounded, contacts)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
@@ -185,6 +187,11 @@ def from_mjcf(
         dynamics = dynamics.steered(bool(phases), model_numbers, names)
     bounds = _bounds(mj_model, bounded, x_bounds, u_bounds)
     found = examine(mj_model, name, x0, contacts, bounded, kept_contacts(planned))
+    if found.obstacle and by_default:
+        fewer = without_own(mj_model, name, x0, bounded, contacts)
+        if fewer is not None:
+            contacts, found = fewer
+            dynamics = replace(dynamics, model=put_model(mj_model, contacts, bounded))
     if found.obstacle:
         raise DraxError(found.obstacle)
     for note in (left_out, *found.notes) if left_out else found.notes:

@@ -1,14 +1,23 @@
-"""Which contacts a plan has by default, where a model has more than can be computed."""
+"""Which contacts a plan has by default, where a model has more than can be computed, or others."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from mjx_drax.physics.agreement.checks import samples
+from mjx_drax.physics.agreement.checks import Findings, examine, samples
 from mjx_drax.physics.c_engine.states import Engine, quiet, set_state
 from mjx_drax.physics.contacts.collision import corners
-from mjx_drax.physics.contacts.pairs import Contacts, Pair, contact_pairs, geom_name
+from mjx_drax.physics.contacts.pairs import (
+    Contacts,
+    Pair,
+    contact_pairs,
+    geom_name,
+    touching,
+)
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.physics.mjx_model import OTHER_CONTACTS, kept_contacts, put_model
 
 MOST_WORK = 2_000_000
 """Pairs of corners of hulls that a step may compare: MJX compares every edge with every other."""
@@ -50,6 +59,41 @@ def affordable(
         f'other, such as {names}. Choose them by contacts=[("foot_*", "floor"), ...].'
     )
     return sorted(kept), note
+
+
+def without_own(
+    model: mujoco.MjModel,
+    name: str,
+    x_init: np.ndarray,
+    bounded: np.ndarray,
+    contacts: Contacts,
+    derivatives: bool = False,
+) -> tuple[Contacts, Findings] | None:
+    """Fewer contacts than those that a model cannot be planned with, and what `examine` finds then.
+
+    Left out are those of one robot's parts with each other that MJX computes differently, as of two
+    cylinders. They are rarely meant, and replays have them. None if that does not help.
+    """
+    every = touching(model, contacts)
+    other = {
+        (a, b)
+        for a, b in every
+        if (int(model.geom_type[a]), int(model.geom_type[b])) in OTHER_CONTACTS
+        and model.body_rootid[model.geom_bodyid[a]] == model.body_rootid[model.geom_bodyid[b]]
+    }
+    if not other:
+        return None
+    fewer: Contacts = sorted(every - other) or False
+    kept = kept_contacts(put_model(model, fewer, bounded))
+    found = examine(model, name, x_init, fewer, bounded, kept, derivatives)
+    if found.obstacle is not None:
+        return None
+    names = " with ".join(repr(geom_name(model, g)) for g in min(other))
+    note = (
+        f"the plan has no contacts of {len(other)} pairs of parts of {name} with each other, such "
+        f"as {names}: MJX computes them differently. Replays have them."
+    )
+    return fewer, replace(found, notes=(note, *found.notes))
 
 
 def _work(model: mujoco.MjModel, a: int, b: int) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
+from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.actuators import control_ranges, largest_moment_arms
 from mjx_drax.physics.agreement.checks import Findings, checked_start, examine, require_traceable
 from mjx_drax.physics.agreement.differences import differences
@@ -24,7 +25,7 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.motors import Actuators
-from mjx_drax.physics.near import affordable
+from mjx_drax.physics.near import affordable, without_own
 from mjx_drax.physics.source import load, model_name
 
 Report = dict[str, Any]
@@ -83,27 +84,38 @@ def check(
     try:
         x_init, bounded = checked_start(model, name)
         report["joints"] = _joints(model, bounded)
+        by_default = contacts is True
         contacts, left_out = affordable(model, name, x_init, bounded, contacts)
         report["notes"] = [left_out] if left_out else []
         report["differences"] = [each.sentence for each in differences(model, contacts)]
         planned = put_model(model, contacts, bounded)
-        report["sizes"]["constraint_rows"] = constraint_rows(planned)
-        report["contact_points"] = {
-            "all": len(contact_points(put_model(model, np.iinfo(int).max))),
-            "kept": len(contact_points(planned)),
-            "nearest": kept_contacts(planned),
-        }
+        report["contact_points"]["all"] = len(contact_points(put_model(model, np.iinfo(int).max)))
+        _count(report, planned)
         progress(f"{name}: compiling one step of MJX and its derivatives ...")
         dynamics = MjxDynamics(planned, report["timing"]["dt"], model, steps)
         require_traceable(model, name, dynamics.observe)
         kept = kept_contacts(planned)
         found = examine(model, name, x_init, contacts, bounded, kept, derivatives=True)
+        if found.obstacle and by_default:
+            fewer = without_own(model, name, x_init, bounded, contacts, derivatives=True)
+            if fewer is not None:
+                contacts, found = fewer
+                _count(report, put_model(model, contacts, bounded))
         report["agreement"] = _agreement(found)
         report["notes"] += found.notes
         report["obstacle"] = found.obstacle
     except DraxError as error:
         report["obstacle"] = str(error)
     return report
+
+
+def _count(report: Report, planned: mjx.Model) -> None:
+    """Write down the constraints and contacts of a plan."""
+    report["sizes"]["constraint_rows"] = constraint_rows(planned)
+    report["contact_points"] |= {
+        "kept": len(contact_points(planned)),
+        "nearest": kept_contacts(planned),
+    }
 
 
 def _agreement(found: Findings) -> Report:

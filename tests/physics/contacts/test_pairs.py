@@ -11,7 +11,7 @@ import pytest
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics import near
-from mjx_drax.physics.agreement.checks import Samples, compare, examine
+from mjx_drax.physics.agreement.checks import Findings, Samples, compare, examine
 from mjx_drax.physics.c_engine.states import Engine
 from mjx_drax.physics.contacts.pairs import contact_pairs, left_out
 from mjx_drax.physics.dynamics import MjxDynamics
@@ -128,3 +128,51 @@ def test_of_too_many_contacts_the_nearest_are_kept(monkeypatch):
     with pytest.warns(DraxWarning, match="8 pairs .* 2 that come closest"):
         from_mjcf(model, horizon=0.1, running_cost=lambda data, u: u @ u)
     assert near.affordable(model, "walker", x, none, 3) == (3, None)
+
+
+CROSSED = """
+<mujoco model="crossed"><option timestep="0.01"/><worldbody>
+  <geom name="floor" type="plane" size="1 1 1"/>
+  <body name="trunk" pos="0 0 1"><freejoint/><geom size="0.05" mass="1"/>
+    <body pos="0.2 0 0"><joint name="one" axis="0 1 0"/>
+      <geom name="left" type="cylinder" size="0.05 0.2" mass="1"/></body>
+    <body pos="0.2 0.085 0"><joint name="two" axis="1 0 0"/>
+      <geom name="right" type="cylinder" size="0.05 0.2" euler="0 60 0" mass="1"/></body></body>
+  {more}</worldbody><actuator><motor joint="one"/><motor joint="two"/></actuator></mujoco>"""
+
+
+def test_parts_of_one_robot_that_differ_may_be_left_out(monkeypatch):
+    other = '<body pos="9 0 0"><freejoint/><geom name="box" type="cylinder" size="0.1 0.1"/></body>'
+    model = mujoco.MjModel.from_xml_string(CROSSED.format(more=other))
+    seen = []
+
+    def examine(model, name, x_init, contacts, *rest):
+        seen.append(contacts)
+        return Findings(None, ("else",), "it still differs" if len(seen) > 1 else None)
+
+    monkeypatch.setattr(near, "examine", examine)
+    x, bounded = np.concatenate([model.qpos0, np.zeros(model.nv)]), np.zeros(model.njnt, bool)
+    contacts, found = near.without_own(model, "crossed", x, bounded, True)
+    left, right, box = (model.geom(name).id for name in ("left", "right", "box"))
+    assert contacts == seen[0] == sorted({*contact_pairs(model)} - {(left, right)})
+    assert (left, box) in contacts  # what it handles is not a part of it
+    assert "1 pairs of parts of crossed with each other, such as 'left' with" in found.notes[0]
+    assert near.without_own(model, "crossed", x, bounded, True) is None
+    assert near.without_own(model, "crossed", x, bounded, contacts) is None
+
+
+@pytest.mark.slow
+def test_a_robot_whose_parts_differ_is_planned_without_them():
+    model = mujoco.MjModel.from_xml_string(CROSSED.format(more=""))
+    report = check(model)
+    assert report["obstacle"] is None
+    assert "of 1 pairs of parts of crossed" in report["notes"][0]
+    with pytest.warns(DraxWarning, match="of 1 pairs of parts of crossed"):
+        problem = from_mjcf(model, horizon=0.1, running_cost=lambda data, u: u @ u)
+    left, right = (model.geom(name).id for name in ("left", "right"))
+    assert left_out(model, problem.dynamics.contacts) == {(left, right)}
+    assert report["contact_points"]["kept"] == len(contact_points(problem.dynamics.model))
+    with pytest.raises(DraxError, match=r"differs .* by .* that of 'left' with 'right' differ"):
+        from_mjcf(
+            model, horizon=0.1, running_cost=lambda data, u: u @ u, contacts=[("left", "right")]
+        )
