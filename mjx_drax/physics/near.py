@@ -25,6 +25,8 @@ MOST_WORK = 2_000_000
 EACH = 20_000
 """What every pair counts besides, because each function of MJX takes time to compile."""
 
+MESH, BOX = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_BOX)
+
 NEAR, MOTIONS = 0.1, 4
 """Distances up to which they are exact [m], and random motions from x_init of 0.6 s that are looked
 at."""
@@ -72,28 +74,31 @@ def without_own(
     """Fewer contacts than those that a model cannot be planned with, and what `examine` finds then.
 
     Left out are those of one robot's parts with each other that MJX computes differently, as of two
-    cylinders. They are rarely meant, and replays have them. None if that does not help.
+    cylinders; if that is not enough, those of hulls too. They are rarely meant, and replays have
+    them. None if that does not help.
     """
     every = touching(model, contacts)
-    other = {
-        (a, b)
-        for a, b in every
-        if (int(model.geom_type[a]), int(model.geom_type[b])) in OTHER_CONTACTS
-        and model.body_rootid[model.geom_bodyid[a]] == model.body_rootid[model.geom_bodyid[b]]
-    }
-    if not other:
-        return None
-    fewer: Contacts = sorted(every - other) or False
-    kept = kept_contacts(put_model(model, fewer, bounded))
-    found = examine(model, name, x_init, fewer, bounded, kept, derivatives)
-    if found.obstacle is not None:
-        return None
-    names = " with ".join(repr(geom_name(model, g)) for g in min(other))
-    note = (
-        f"the plan has no contacts of {len(other)} pairs of parts of {name} with each other, such "
-        f"as {names}: MJX computes them differently. Replays have them."
-    )
-    return fewer, replace(found, notes=(note, *found.notes))
+    root = model.body_rootid[model.geom_bodyid]
+    own = {(a, b) for a, b in every if root[a] == root[b]}
+    kinds = {pair: tuple(model.geom_type[list(pair)].tolist()) for pair in own}
+    differ = {pair for pair in own if kinds[pair] in OTHER_CONTACTS}
+    hulls = {pair for pair in own if set(kinds[pair]) <= {MESH, BOX}}
+    tried: set[Pair] = set()
+    for other in (differ, differ | hulls):
+        if other == tried:
+            continue
+        tried = other
+        fewer: Contacts = sorted(every - other) or False
+        kept = kept_contacts(put_model(model, fewer, bounded))
+        found = examine(model, name, x_init, fewer, bounded, kept, derivatives)
+        if found.obstacle is None:
+            names = " with ".join(repr(geom_name(model, g)) for g in min(other))
+            note = (
+                f"the plan has no contacts of {len(other)} pairs of parts of {name} with each "
+                f"other, such as {names}: MJX computes them differently. Replays have them."
+            )
+            return fewer, replace(found, notes=(note, *found.notes))
+    return None
 
 
 def _work(model: mujoco.MjModel, a: int, b: int) -> int:
