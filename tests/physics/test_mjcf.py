@@ -416,7 +416,7 @@ def test_what_mjx_fails_in_is_refused(monkeypatch):
     def missing(*_):
         raise TypeError("no gather")
 
-    monkeypatch.setattr(physics.mjx, "sensor_acc", missing)
+    monkeypatch.setattr(physics.mjx, "transmission", missing)
     words = r"MJX fails in a step of arm \(TypeError: no gather\): leave out sensors"
     model = arm(joint='damping="0.0123"')  # one that has not been traced before
     with pytest.raises(DraxError, match=words):
