@@ -123,8 +123,8 @@ def test_a_guess_that_is_better_than_what_is_found_is_polished():
         )
 
     ahead = solve(problem(u_scatter=([-1.0, 0.5], [1.0, 1.0])), chains=12, progress=False)
-    behind = solve(problem(), chains=2, progress=False)
+    behind = solve(problem(), chains=1, progress=False)
     assert behind.replay_cost.min() > 1.05 * ahead.replay_cost.min()
-    found = solve(problem(), chains=2, guess=ahead.best, progress=False)
+    found = solve(problem(), chains=1, guess=ahead.best, progress=False)
     assert found.optimal
     assert found.replay_cost.max() == pytest.approx(ahead.replay_cost.min(), rel=1e-3)
