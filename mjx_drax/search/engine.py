@@ -49,6 +49,7 @@ from mjx_drax.search.chains import (
 )
 from mjx_drax.search.checkpoint import Checkpoint, facts
 from mjx_drax.search.checks import require_alive, require_finite, require_sound
+from mjx_drax.search.decisions import Decisions
 from mjx_drax.search.devices import gathered, on_host, split_over
 from mjx_drax.search.family import Family
 from mjx_drax.search.initial import initial_knots, knots_by_row, problem_keys
@@ -59,7 +60,6 @@ from mjx_drax.search.iterate import (
     iterate,
     noise_at,
 )
-from mjx_drax.search.policy import Policy
 from mjx_drax.search.recording import LIMIT, Recorder, knot_defects
 from mjx_drax.search.replayer import Replayer
 from mjx_drax.search.restarts import Restarts, Rollouts, scale_of
@@ -191,16 +191,15 @@ class Search:
     # Attempts and chunks
 
     @property
-    def policy(self) -> Policy:
-        """What decides of its chains."""
-        return Policy(self.settings, self.chains, self.family.alone, self.mesh)
+    def decisions(self) -> Decisions:
+        """What is decided of its chains."""
+        return Decisions(self.settings, self.chains, self.family.alone, self.mesh)
 
     @property
     def few(self) -> int:
         """Problems of the second program; 0: there is none."""
-        many = (
-            self.size * self.chains >= MANY and self.mesh is None and self.policy.polish is not None
-        )
+        polished = self.decisions.polish is not None
+        many = self.size * self.chains >= MANY and self.mesh is None and polished
         return self.size // FEWER if many and not self.family.alone else 0
 
     def places(self, attempt: int) -> int:
@@ -331,7 +330,7 @@ class Search:
 
     def _polished(self, guessed: Chains) -> Chains:
         """A guess after a polish of its own, which no attempt has made of it as it is."""
-        if self.policy.polish is None or isinstance(self.guess, Warm):
+        if self.decisions.polish is None or isinstance(self.guess, Warm):
             return guessed
         noisy = self.flow.iterations  # after which a chain would be rolled out
         state, info = self._iterated(guessed.state, noisy + 1, noisy + self.settings.after)
@@ -380,7 +379,8 @@ class Search:
         sizes = jax.tree.map(np.asarray, self._sizes(stage.now.state))
         of_problem = jax.tree.map(lambda a: a.reshape(len(indices), -1), sizes)
         scale, floor = stage.cost_scale.copy(), stage.floor.copy()
-        scale[indices], floor[indices] = scale_and_floor(of_problem, self.policy.polish is not None)
+        polished = self.decisions.polish is not None
+        scale[indices], floor[indices] = scale_and_floor(of_problem, polished)
         self.stage = replace(stage, cost_scale=scale, floor=floor)
         self._settle(0, False, indices, scale)
 
@@ -415,13 +415,13 @@ class Search:
 
     def _next_attempt(self) -> bool:
         """Go on to another attempt, or finish; False if nothing more is to be done."""
-        stage, policy, family = self.stage, self.policy, self.family
+        stage, decisions, family = self.stage, self.decisions, self.family
         kept = stage.kept
         assert kept is not None
         if stage.finishing:
-            assert policy.polish is not None
-            return stage.finishing < policy.polish.patience and self._begin_to_finish()
-        todo, heated = policy.next_attempt(stage, self.places(0))
+            assert decisions.polish is not None
+            return stage.finishing < decisions.polish.patience and self._begin_to_finish()
+        todo, heated = decisions.next_attempt(stage, self.places(0))
         if stage.attempt + 1 == self.settings.attempts or not len(todo):
             return self._begin_to_finish()
         scale = stricter(stage.cost_scale, kept.feasible.reshape(family.count, self.chains))
@@ -433,10 +433,10 @@ class Search:
     def _begin_to_finish(self) -> bool:
         """Continue the polish of kept chains that were stopped early; False if there are none."""
         stage, kept = self.stage, self.stage.kept
-        if not self.policy.ends_early:
+        if not self.decisions.ends_early:
             return False
         assert kept is not None
-        unfinished = self.policy.unfinished(stage, kept)
+        unfinished = self.decisions.unfinished(stage, kept)
         if not unfinished.any():
             return False
         done = int(np.asarray(kept.state.polish.iterations)[unfinished].min())
@@ -470,7 +470,7 @@ class Search:
         if stage.finishing:
             assert kept is not None
             return finished(kept, now, stage.floor[0])
-        owners = self.policy.owners(stage, self.indices, now)
+        owners = self.decisions.owners(stage, self.indices, now)
         if self.recorder is not None:
             self.recorder.belong(owners.ravel(), now.missed)
         if kept is None:
@@ -548,7 +548,7 @@ class Search:
             self.flow = replace(flow, scale=scale_of(1.0, 1.0))
         scale = Scale(cost, noise)
         shared, own = self.family.question(
-            self.flow, scale, indices, self.chains, self.policy.polish
+            self.flow, scale, indices, self.chains, self.decisions.polish
         )
         # once: to send its dozens of numbers with every launch takes longer than an iteration
         self.question = jax.device_put(shared), own
@@ -582,7 +582,7 @@ class Search:
                 stop = self._next_report(total)
                 state, info = self._iterated(now.state, stage.step, stop)
                 if self._thins_out:
-                    moving = np.flatnonzero(self.policy.moving(state))
+                    moving = np.flatnonzero(self.decisions.moving(state))
                     if len(moving) <= self.few * self.chains:
                         state, info = self._go_on(state, info, moving, stop, total)
                         stop = total
@@ -627,7 +627,7 @@ class Search:
             require_alive(self.flow, self.family.at(0), replace(knots, slack=None), died_at)
 
     def _waits(self) -> bool:
-        """Whether to go on with an attempt; see `Policy.waits`.
+        """Whether to go on with an attempt; see `Decisions.waits`.
 
         It depends on the chains alone, and is asked at the usual reports only, so solves that are
         resumed or recorded end where others do. A batch is not asked: answers would depend on what
@@ -635,10 +635,10 @@ class Search:
         """
         stage, noisy = self.stage, self.flow.iterations
         usual = self._usual_report(noisy + self.settings.after)
-        polished = self.policy.polish is not None and stage.step > noisy
+        polished = self.decisions.polish is not None and stage.step > noisy
         if not (polished and self.family.alone and stage.step % usual == 0):
             return True
-        return self.policy.waits(stage, self.indices, usual, self.places(stage.attempt + 1))
+        return self.decisions.waits(stage, self.indices, usual, self.places(stage.attempt + 1))
 
     def _usual_report(self, total: int) -> int:
         """Iterations between two reports of an attempt of so many."""
@@ -745,12 +745,15 @@ class Search:
         if not ended:
             raise KeyboardInterrupt
 
-    def _again_with(self, damping: np.ndarray, iterations: int) -> Chains:
-        """The chunk's chains after the last iterations of an attempt again, damped so (rows,)."""
+    def _again_with(self, damping: np.ndarray, iterations: int) -> tuple[State, Info]:
+        """States and diagnostics after the last iterations of an attempt again, damped so (rows,).
+
+        The states are on one device.
+        """
         state, end = self.stage.now.state, self.flow.iterations + self.settings.after
         damped = replace(state, damping=jnp.asarray(damping, state.damping.dtype))
         state, info = self._iterated(damped, end - iterations, end)
-        return self._whole(Chains.of(state, info, self.stage.now.feasible_since))
+        return gathered(state, self.mesh), info
 
     # Reports, recordings, checkpoints
 
@@ -806,7 +809,7 @@ class Search:
         nx, nu, dtype = problem.dynamics.nx, problem.dynamics.nu, problem.x_init.dtype
         ones = Scale(np.ones(self.size), np.ones(self.size))
         none = np.zeros(self.size, int)
-        shared, own = family.question(settings.flow, ones, none, self.chains, self.policy.polish)
+        shared, own = family.question(settings.flow, ones, none, self.chains, self.decisions.polish)
 
         def state() -> State:
             x, u = (jnp.zeros((rows, problem.horizon, n), dtype) for n in (nx, nu))

@@ -11,7 +11,8 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING
+from mjx_drax.method.descent import DAMPING_RANGE, LESS_DAMPING, MORE_DAMPING, Info
+from mjx_drax.method.langevin import State
 from mjx_drax.search.chains import Chains, Stage, best_of
 from mjx_drax.search.iterate import box_of_controls
 from mjx_drax.search.replayer import Replayer
@@ -81,18 +82,18 @@ def shot(
 
 
 def after_round(
-    stage: Stage, rollouts: Rollouts, replayer: Replayer, iterated: Callable[[np.ndarray], Chains]
+    stage: Stage,
+    rollouts: Rollouts,
+    replayer: Replayer,
+    iterated: Callable[[np.ndarray], tuple[State, Info]],
 ) -> Stage:
     """After a round: iterations with a damping of each row, and rollouts of what they changed."""
     now, damping, count = stage.now, stage.damping, stage.rollouts + 1
     done = stage.done + rollouts.iterations
     # Chains that the largest damping has left as they were would come to the same again
     rows, most = np.flatnonzero(np.isfinite(damping)), DAMPING_RANGE[1]
-    found = replace(
-        iterated(np.minimum(damping, most)),
-        feasible_since=np.full(len(now.missed), done),
-        missed=np.ones(len(now.missed), bool),  # until it is shown
-    )
+    missed = np.ones(len(now.missed), bool)  # until it is shown
+    found = Chains(*iterated(np.minimum(damping, most)), np.full(len(missed), done), missed)
     found, better = replayer.rolled_out_in_part(now, found, rows, done)
     before, now = now, best_of(now, found, np.arange(len(now.missed)))
     factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))

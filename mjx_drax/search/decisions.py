@@ -28,7 +28,7 @@ STRAGGLERS = 0.0005
 
 
 @dataclass(frozen=True)
-class Policy:
+class Decisions:
     """The decisions of one call, from where its chains are.
 
     Attributes:
