@@ -190,8 +190,8 @@ def from_mjcf(
     if found.obstacle and by_default:
         fewer = without_own(mj_model, name, x0, bounded, contacts)
         if fewer is not None:
-            contacts, found = fewer
-            dynamics = replace(dynamics, model=put_model(mj_model, contacts, bounded))
+            planned, found = fewer
+            dynamics = replace(dynamics, model=planned)
     if found.obstacle:
         raise DraxError(found.obstacle)
     for note in (left_out, *found.notes) if left_out else found.notes:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.agreement.checks import Findings, examine, samples
 from mjx_drax.physics.c_engine.states import Engine, quiet, set_state
 from mjx_drax.physics.contacts.collision import corners
@@ -14,6 +15,7 @@ from mjx_drax.physics.contacts.pairs import (
     Pair,
     contact_pairs,
     geom_name,
+    of_hulls,
     touching,
 )
 from mjx_drax.physics.engine import mujoco
@@ -24,8 +26,6 @@ MOST_WORK = 2_000_000
 
 EACH = 20_000
 """What every pair counts besides, because each function of MJX takes time to compile."""
-
-MESH, BOX = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_BOX)
 
 NEAR, MOTIONS = 0.1, 4
 """Distances up to which they are exact [m], and random motions from x_init of 0.6 s that are looked
@@ -70,8 +70,8 @@ def without_own(
     bounded: np.ndarray,
     contacts: Contacts,
     derivatives: bool = False,
-) -> tuple[Contacts, Findings] | None:
-    """Fewer contacts than those that a model cannot be planned with, and what `examine` finds then.
+) -> tuple[mjx.Model, Findings] | None:
+    """The model of a plan with fewer contacts than one is refused with, and its findings.
 
     Left out are those of one robot's parts with each other that MJX computes differently, as of two
     cylinders; if that is not enough, those of hulls too. They are rarely meant, and replays have
@@ -80,16 +80,16 @@ def without_own(
     every = touching(model, contacts)
     root = model.body_rootid[model.geom_bodyid]
     own = {(a, b) for a, b in every if root[a] == root[b]}
-    kinds = {pair: tuple(model.geom_type[list(pair)].tolist()) for pair in own}
-    differ = {pair for pair in own if kinds[pair] in OTHER_CONTACTS}
-    hulls = {pair for pair in own if set(kinds[pair]) <= {MESH, BOX}}
+    differ = {pair for pair in own if tuple(model.geom_type[list(pair)]) in OTHER_CONTACTS}
+    hulls = {pair for pair in own if of_hulls(model, pair)}
     tried: set[Pair] = set()
     for other in (differ, differ | hulls):
         if other == tried:
             continue
         tried = other
         fewer: Contacts = sorted(every - other) or False
-        kept = kept_contacts(put_model(model, fewer, bounded))
+        planned = put_model(model, fewer, bounded)
+        kept = kept_contacts(planned)
         found = examine(model, name, x_init, fewer, bounded, kept, derivatives)
         if found.obstacle is None:
             names = " with ".join(repr(geom_name(model, g)) for g in min(other))
@@ -97,7 +97,7 @@ def without_own(
                 f"the plan has no contacts of {len(other)} pairs of parts of {name} with each "
                 f"other, such as {names}: MJX computes them differently. Replays have them."
             )
-            return fewer, replace(found, notes=(note, *found.notes))
+            return planned, replace(found, notes=(note, *found.notes))
     return None
 
 

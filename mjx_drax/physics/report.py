@@ -99,8 +99,8 @@ def check(
         if found.obstacle and by_default:
             fewer = without_own(model, name, x_init, bounded, contacts, derivatives=True)
             if fewer is not None:
-                contacts, found = fewer
-                _count(report, put_model(model, contacts, bounded))
+                planned, found = fewer
+                _count(report, planned)
         report["agreement"] = _agreement(found)
         report["notes"] += found.notes
         report["obstacle"] = found.obstacle

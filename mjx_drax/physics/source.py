@@ -76,7 +76,7 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
                 raise DraxError(f"there is no model file {shown(str(source))}: {what}.")
             if is_binary(source):
                 return mujoco.MjModel.from_binary_path(str(source))
-            if actuators is not None or _found_meshes(Path(source)):
+            if actuators is not None or _with_mesh_paths(Path(source)):
                 return _spec(source, actuators).compile()
             return mujoco.MjModel.from_xml_path(str(Path(source).absolute()))
     except DraxError:
@@ -86,7 +86,7 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
             f"the model is {shown(source)}: give an MJCF file, its XML as a text, or a "
             "mujoco.MjModel."
         ) from error
-    except (ValueError, OSError, ElementTree.ParseError, mujoco.FatalError) as error:
+    except (ValueError, OSError, mujoco.FatalError) as error:
         words = " ".join(str(error).split())
         usual = "Compile it again, with this MuJoCo." if is_binary(source) else "Correct the MJCF."
         fix = next((fix for part, fix in _FIXES.items() if part in words), usual)
@@ -99,7 +99,7 @@ def _spec(source: str | Path, actuators: Actuators | None) -> mujoco.MjSpec:
     """What MuJoCo compiles, of a file or an XML string."""
     if is_xml(source):
         spec = mujoco.MjSpec.from_string(source)
-    elif (urdf := _found_meshes(Path(source))) is not None:
+    elif (urdf := _with_mesh_paths(Path(source))) is not None:
         spec = mujoco.MjSpec.from_string(urdf)
     else:  # absolute, as in `_compiled`: a model holds paths of models that it attaches
         spec = mujoco.MjSpec.from_file(str(Path(source).absolute()))
@@ -108,7 +108,7 @@ def _spec(source: str | Path, actuators: Actuators | None) -> mujoco.MjSpec:
     return spec
 
 
-def _found_meshes(path: Path) -> str | None:
+def _with_mesh_paths(path: Path) -> str | None:
     """A URDF whose meshes are named by their packages, with the files' paths; None of other files.
 
     ROS knows where packages are. Here a package is a folder of that name above the URDF, or beside
@@ -120,7 +120,10 @@ def _found_meshes(path: Path) -> str | None:
     text = path.read_bytes()
     if _PACKAGE.encode() not in text:
         return None
-    root = ElementTree.fromstring(text)
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:  # MuJoCo says what is wrong
+        return None
     if root.tag != "robot":
         return None
     above = path.absolute().parents
@@ -129,17 +132,16 @@ def _found_meshes(path: Path) -> str | None:
         name = mesh.get("filename", "")
         if name.startswith(_PACKAGE):
             places = [folder / name[len(_PACKAGE) :] for folder in above]
-            fix = "put the URDF into its package, or correct the name"
+            missing = "in a folder above it: put the URDF into its package, or correct the name"
         else:
             places = [above[0] / name.removeprefix("file://"), above[0] / Path(name).name]
-            fix = "put that file there, or correct the name"
+            missing = "there: put that file there, or correct the name"
         found = next((place for place in places if place.is_file()), None)
         if found is None and mesh in seen:
             continue
         if found is None:
             raise DraxError(
-                f"the URDF {shown(str(path))} names the mesh {shown(name)}, which is not "
-                f"{'in a folder above it' if name.startswith(_PACKAGE) else 'there'}: {fix}."
+                f"the URDF {shown(str(path))} names the mesh {shown(name)}, which is not {missing}."
             )
         mesh.set("filename", str(found))
     extension = root.find("mujoco")

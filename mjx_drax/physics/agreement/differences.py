@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_drax.physics.contacts.pairs import Contacts, Pair, geom_name, touching
+from mjx_drax.physics.contacts.pairs import Contacts, Pair, geom_name, of_hulls, touching
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjx_model import (
     IMPLICIT,
@@ -125,7 +125,7 @@ def differences(
             setting("body_plugin geom_plugin actuator_plugin sensor_plugin", -1),
         ),
         (
-            [_hulls(model, pair) and model.geom_margin[list(pair)].any() for pair in pairs],
+            [model.geom_margin[list(pair)].any() and of_hulls(model, pair) for pair in pairs],
             "hulls of meshes touch where they overlap, and not at a margin: set it to 0",
             setting("geom_margin", 0.0),
         ),
@@ -140,12 +140,6 @@ def differences(
             )
             return [*found, Difference(sentence, disabling(_DISABLE.mjDSBL_CONTACT))]
     return found
-
-
-def _hulls(model: mujoco.MjModel, pair: Pair) -> bool:
-    """Whether the contacts of two geoms are those of hulls."""
-    hulls = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_BOX
-    return bool(np.isin(model.geom_type[list(pair)], hulls).all())
 
 
 PARTS = {

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mjx_drax.base.meanwhile import Meanwhile
-from mjx_drax.physics.contacts.pairs import Contacts, Pair, left_out
+from mjx_drax.physics.contacts.pairs import Contacts, Pair, left_out, of_hulls
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import Joints
 
@@ -215,10 +215,7 @@ class Engine:
 
     def hulls_touch(self, x: Floats) -> bool:
         """Whether at x (nx,) a contact of a mesh with a box or a mesh acts."""
-        contact = self._contacts(x)
-        kinds = self.model.geom_type[contact.geom[contact.efc_address >= 0]]
-        mesh, box = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_BOX
-        return bool(((kinds == mesh).any(axis=1) & np.isin(kinds, (mesh, box)).all(axis=1)).any())
+        return any(of_hulls(self.model, pair) for pair in self.touching(x))
 
     def _contacts(self, x: Floats) -> Any:
         """All contacts at x (nx,), whether they act or not."""

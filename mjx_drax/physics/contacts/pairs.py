@@ -26,6 +26,13 @@ def geom_name(model: mujoco.MjModel, g: int) -> str:
     return str(geom.name or f"geom {g} of body {model.body(body).name or body}")
 
 
+def of_hulls(model: mujoco.MjModel, pair: Sequence[int]) -> bool:
+    """Whether two geoms touch as convex hulls: a mesh with a mesh or a box."""
+    mesh, box = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_BOX
+    kinds = set(model.geom_type[list(pair)].tolist())
+    return mesh in kinds and kinds <= {mesh, box}
+
+
 def contact_pairs(model: mujoco.MjModel) -> Iterator[Pair]:
     """All pairs of geoms between which MuJoCo may make a contact; the lower type comes first."""
     if not model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):

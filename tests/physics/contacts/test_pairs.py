@@ -131,19 +131,24 @@ def test_of_too_many_contacts_the_nearest_are_kept(monkeypatch):
 
 
 CROSSED = """
-<mujoco model="crossed"><option timestep="0.01"/><worldbody>
+<mujoco model="crossed"><option timestep="0.01"/><asset>
+  <mesh name="hull" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/></asset><worldbody>
   <geom name="floor" type="plane" size="1 1 1"/>
   <body name="trunk" pos="0 0 1"><freejoint/><geom size="0.05" mass="1"/>
     <body pos="0.2 0 0"><joint name="one" axis="0 1 0"/>
-      <geom name="left" type="cylinder" size="0.05 0.2" mass="1"/></body>
+      <geom name="left" {shape} mass="1"/></body>
     <body pos="0.2 0.085 0"><joint name="two" axis="1 0 0"/>
-      <geom name="right" type="cylinder" size="0.05 0.2" euler="0 60 0" mass="1"/></body></body>
+      <geom name="right" {shape} euler="0 60 0" mass="1"/></body></body>
   {more}</worldbody><actuator><motor joint="one"/><motor joint="two"/></actuator></mujoco>"""
+
+
+def crossed(shape='type="cylinder" size="0.05 0.2"', more=""):
+    return mujoco.MjModel.from_xml_string(CROSSED.format(shape=shape, more=more))
 
 
 def test_parts_of_one_robot_that_differ_may_be_left_out(monkeypatch):
     other = '<body pos="9 0 0"><freejoint/><geom name="box" type="cylinder" size="0.1 0.1"/></body>'
-    model = mujoco.MjModel.from_xml_string(CROSSED.format(more=other))
+    model, hulls = crossed(more=other), crossed('type="mesh" mesh="hull"', other)
     seen, helps = [], 1
 
     def examine(model, name, x_init, contacts, *rest):
@@ -152,21 +157,23 @@ def test_parts_of_one_robot_that_differ_may_be_left_out(monkeypatch):
 
     monkeypatch.setattr(near, "examine", examine)
     x, bounded = np.concatenate([model.qpos0, np.zeros(model.nv)]), np.zeros(model.njnt, bool)
-    contacts, found = near.without_own(model, "crossed", x, bounded, True)
+    _, found = near.without_own(model, "crossed", x, bounded, True)
+    contacts = seen[0]
     left, right, box = (model.geom(name).id for name in ("left", "right", "box"))
-    assert contacts == seen[0] == sorted({*contact_pairs(model)} - {(left, right)})
+    assert contacts == sorted({*contact_pairs(model)} - {(left, right)})
     assert (left, box) in contacts  # what it handles is not a part of it
     assert "1 pairs of parts of crossed with each other, such as 'left' with" in found.notes[0]
     assert near.without_own(model, "crossed", x, bounded, True) is None
     assert near.without_own(model, "crossed", x, bounded, contacts) is None
-    model.geom_type[[left, right]], helps = mujoco.mjtGeom.mjGEOM_BOX, 9  # hulls
-    contacts, _ = near.without_own(model, "crossed", x, bounded, True)
-    assert contacts == sorted({*contact_pairs(model)} - {(left, right)})
+    helps = 9
+    planned, _ = near.without_own(hulls, "crossed", x, bounded, True)
+    assert seen[-1] == sorted({*contact_pairs(hulls)} - {(left, right)})
+    assert len(contact_points(planned)) < len(contact_points(put_model(hulls, True)))
 
 
 @pytest.mark.slow
 def test_a_robot_whose_parts_differ_is_planned_without_them():
-    model = mujoco.MjModel.from_xml_string(CROSSED.format(more=""))
+    model = crossed()
     report = check(model)
     assert report["obstacle"] is None
     assert "of 1 pairs of parts of crossed" in report["notes"][0]
