@@ -21,7 +21,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 # Most of the default tests' time goes into compilation, which takes half as long without LLVM's
 # optimizations and XLA's fusion emitters. The slow tests compute more than they compile, and are
 # compiled as users do. Worker processes do not see the arguments, but what is decided here.
-_slow = any("slow" in word for word in sys.argv)
+_slow = any("slow" in word and "not slow" not in word for word in sys.argv)
 _quick = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "0" if _slow else "1") == "1"
 if _quick and version("jaxlib").startswith("0.10."):  # later ones end at a flag they do not know
     _flags = os.environ.get("XLA_FLAGS", "")

@@ -68,7 +68,7 @@ def run_once(function: Callable[..., Any], *arguments: Any) -> Any:
         device = jax.local_devices(backend="cpu")[0]
     except RuntimeError:  # JAX was told to have none
         return jax.jit(function)(*arguments)
-    with jax.default_device(device):
+    with jax.default_device(device), kept.without_locations():
         lowered = jax.jit(function).lower(*jax.device_put(arguments, device))
         try:
             program = lowered.compile(

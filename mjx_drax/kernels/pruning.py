@@ -17,12 +17,18 @@ def pruned(function: Function) -> Function:
     """The same function of pytrees of arrays, without the operations that its result does not need.
 
     XLA drops these, but only after JAX has differentiated and lowered them; and a step of physics
-    computes much that a cost does not read.
+    computes much that a cost does not read. Arguments of the same shapes are traced once.
     """
+    known: dict[Any, tuple[ClosedJaxpr, Any]] = {}
 
     @wraps(function)
     def lean(*arguments: Any) -> Any:
-        program, inputs, tree = needed_program(function, arguments)
+        inputs, structure = jax.tree.flatten(arguments)
+        asked = structure, *map(jax.typeof, inputs)
+        if asked not in known:
+            program, _, tree = needed_program(function, arguments)
+            known[asked] = program, tree
+        program, tree = known[asked]
         try:
             return jax.tree.unflatten(tree, jaxpr_as_fun(program)(*inputs))
         except TypeError:  # constants that jax kept from another precision

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, DraxWarning, require_part, require_positive, shown
 from mjx_drax.physics.actuators import control_ranges, inverse_dynamics, middle_control
-from mjx_drax.physics.agreement.checks import checked_start, examine, require_traceable
+from mjx_drax.physics.agreement.checks import checked_start, examine, require_sensors
 from mjx_drax.physics.c_engine.model_numbers import set_numbers
 from mjx_drax.physics.c_engine.states import stopped_at_once
 from mjx_drax.physics.contacts.pairs import Contacts
@@ -181,7 +181,7 @@ def from_mjcf(
     contacts, left_out = affordable(mj_model, name, x0, bounded, contacts)
     planned, origin = put_model(mj_model, contacts, bounded), origin_of(model, mj_model, actuators)
     dynamics = MjxDynamics(planned, dt, mj_model, substeps, derivatives, origin)
-    require_traceable(mj_model, name, dynamics.observe)
+    require_sensors(mj_model, name, planned)
     names = fields_of(dynamics, parameters, model_numbers)
     if phases or names:
         dynamics = dynamics.steered(bool(phases), model_numbers, names)

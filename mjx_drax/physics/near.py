@@ -63,6 +63,16 @@ def affordable(
     return sorted(kept), note
 
 
+def parts_differ(
+    model: mujoco.MjModel, x_init: np.ndarray, bounded: np.ndarray, contacts: Contacts
+) -> bool:
+    """Whether parts of one robot that MJX computes differently touch in states about x_init."""
+    engine = Engine(model, contacts)
+    differ = _own(model, contacts)[0]
+    acting = [engine.touching(x) for x in samples(engine, x_init, bounded).x]
+    return any(pair in differ or pair[::-1] in differ for pairs in acting for pair in pairs)
+
+
 def without_own(
     model: mujoco.MjModel,
     name: str,
@@ -78,10 +88,7 @@ def without_own(
     them. None if that does not help.
     """
     every = touching(model, contacts)
-    root = model.body_rootid[model.geom_bodyid]
-    own = {(a, b) for a, b in every if root[a] == root[b]}
-    differ = {pair for pair in own if tuple(model.geom_type[list(pair)]) in OTHER_CONTACTS}
-    hulls = {pair for pair in own if of_hulls(model, pair)}
+    differ, hulls = _own(model, contacts)
     tried: set[Pair] = set()
     for other in (differ, differ | hulls):
         if other == tried:
@@ -99,6 +106,14 @@ def without_own(
             )
             return planned, replace(found, notes=(note, *found.notes))
     return None
+
+
+def _own(model: mujoco.MjModel, contacts: Contacts) -> tuple[set[Pair], set[Pair]]:
+    """Pairs of parts of one robot, those that MJX computes differently, and those of hulls."""
+    root = model.body_rootid[model.geom_bodyid]
+    own = {(a, b) for a, b in touching(model, contacts) if root[a] == root[b]}
+    differ = {pair for pair in own if tuple(model.geom_type[list(pair)]) in OTHER_CONTACTS}
+    return differ, {pair for pair in own if of_hulls(model, pair)}
 
 
 def _work(model: mujoco.MjModel, a: int, b: int) -> int:

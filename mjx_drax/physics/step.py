@@ -84,6 +84,11 @@ def forward(model: mjx.Model, x: Array, u: Array) -> tuple[mjx.Data, tuple[Array
     make compiled functions, which compute only what their caller reads, compute all of them.
     """
     data = _constrained(model, _smooth(model, kinematics(model, data_at(model, x, u))))
+    return with_sensors(model, data)
+
+
+def with_sensors(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, tuple[Array, ...]]:
+    """`data` with all sensors, and each kind alone."""
     readings, every = [], data.sensordata
     for kind in kinds_of_sensors(model):
         mine = model.sensor_type == kind
@@ -280,8 +285,9 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     and bias. Those of f are taken apart for positions, velocities, and activations and controls:
     only positions move bodies and contacts.
     """
+    smooth = jax.jit(partial(_smooth, model))  # so that it is traced once
     start = kinematics(model, data_at(model, x, u))
-    data = _smooth(model, start)
+    data = smooth(start)
     placed, held = data, has_constraints(model)
     M = internal(data).M
     solution = _solution(model, data) if held else (data.qacc_smooth, M)
@@ -292,7 +298,7 @@ def _derivatives(model: mjx.Model, x: Array, u: Array) -> tuple[Array, Array]:
     def sides(changed: dict[str, Array]) -> Array:
         moved = by_q.keys() <= changed.keys()
         if moved:
-            at = _smooth(model, start.replace(**changed))
+            at = smooth(start.replace(**changed))
         else:
             at = _driven(model, placed.replace(**changed))
         pushed = at.qfrc_passive + at.qfrc_actuator + at.qfrc_applied

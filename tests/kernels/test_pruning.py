@@ -26,6 +26,25 @@ def test_pruned_keeps_what_the_result_needs_inside_of_functions_too():
     np.testing.assert_allclose(slope, 2 * np.cos(x), rtol=1e-6)
 
 
+def test_arguments_of_the_same_shapes_are_traced_once():
+    traced = []
+
+    def function(x):
+        traced.append(x.shape)
+        return 2.0 * x
+
+    @jax.jit
+    def sums(x):
+        lean = pruned(function)
+        return lean(x) + lean(-3.0 * x), lean(x[:1]), jax.jvp(lean, (x,), (x,))[1]
+
+    both, one, slope = sums(jnp.arange(2.0))
+    assert traced == [(2,), (1,)]
+    np.testing.assert_array_equal(both, [0.0, -4.0])
+    np.testing.assert_array_equal(one, [0.0])
+    np.testing.assert_array_equal(slope, [0.0, 2.0])
+
+
 def test_pruned_functions_of_pytrees_return_the_same_pytrees():
     def function(x, scale):
         unused = jnp.sort(x)

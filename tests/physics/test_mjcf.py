@@ -424,6 +424,18 @@ def test_what_mjx_fails_in_is_refused(monkeypatch):
     assert re.match(words, check(model)["obstacle"])
 
 
+def test_sensors_that_mjx_fails_in_are_refused(monkeypatch):
+    def missing(*_):
+        raise TypeError("no gather")
+
+    monkeypatch.setattr(physics.mjx, "sensor_vel", missing)
+    model = arm(more='<sensor><jointvel joint="wrist"/></sensor>')
+    words = r"MJX fails in a step of arm \(TypeError: no gather\): leave out sensors"
+    with pytest.raises(DraxError, match=words):
+        problem(model)
+    assert re.match(words, check(model)["obstacle"])
+
+
 @pytest.mark.parametrize("side", [0, 1])
 def test_bounds_of_quaternions_are_refused(side):
     ends = [np.full(12, -np.inf), np.full(12, np.inf)]

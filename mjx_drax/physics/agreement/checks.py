@@ -1,6 +1,6 @@
 """Whether a model can be planned with: all that is asked of it before a problem is built.
 
-`checked_start` asks what needs no MJX, `require_traceable` whether MJX can step the model, and
+`checked_start` asks what needs no MJX, `require_sensors` whether MJX can trace the sensors, and
 `examine` whether its steps are those of MuJoCo's C engine, and what a user should know besides.
 For this, both engines take one step in float64 from the same states. What differs by more than
 rounding is wrong in every plan, and the certificate would find that only after a solve. A cause is
@@ -10,7 +10,8 @@ named if the error is there with it and not without it.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -165,17 +166,27 @@ def _require_regular(model: mujoco.MjModel, name: str, x_init: np.ndarray) -> No
         raise DraxError(f"{name} has no finite acceleration at x_init: give another x_init.")
 
 
-def require_traceable(
-    model: mujoco.MjModel, name: str, forward: Callable[[Array, Array], Any]
-) -> None:
-    """Complain about a model that MJX accepts, but fails in when it traces forward(x, u).
+def require_sensors(model: mujoco.MjModel, name: str, planned: mjx.Model) -> None:
+    """Complain about sensors that MJX accepts, but fails in when it traces them.
 
     Raises:
         DraxError: says in what it fails.
     """
-    x, u = jnp.zeros(model.nq + model.nv + model.na), jnp.zeros(model.nu)
+
+    def sensors(x: Array, u: Array) -> Any:
+        return one_step.with_sensors(planned, one_step.data_at(planned, x, u))
+
+    with _said_of(name):
+        jax.eval_shape(sensors, jnp.zeros(model.nq + model.nv + model.na), jnp.zeros(model.nu))
+
+
+@contextmanager
+def _said_of(name: str) -> Iterator[None]:
+    """What MJX raises while it traces a step of the model `name`, as a DraxError."""
     try:
-        jax.eval_shape(forward, x, u)
+        yield
+    except DraxError:
+        raise
     except Exception as error:  # of any kind, deep inside MJX
         raise DraxError(
             f"MJX fails in a step of {name} ({reason(error)}): leave out sensors, tendons and "
@@ -405,8 +416,8 @@ def examine(
     Raises:
         DraxError: the C engine itself diverges.
     """
-    asked = (name, x_init.tobytes(), contacts, bounded.tobytes(), kept, derivatives, binary(model))
-    key = digest(repr(asked))
+    arrays = digest(binary(model)), x_init.tobytes(), bounded.tobytes()
+    key = digest(repr((name, contacts, kept, derivatives, *arrays)))
     if key not in _EXAMINED:
         keep_programs()
         found = recall(f"findings {key}")
@@ -441,7 +452,8 @@ def _examined(
     lost = kept is not None and most > kept
     if lost and isinstance(contacts, int):
         contacts = most  # an error shall not be that of contacts left out
-    errors = compare(model, at, contacts, bounded, derivatives)
+    with _said_of(name):
+        errors = compare(model, at, contacts, bounded, derivatives)
     error = float(errors.velocity.max())
     notes: list[str | None] = [
         _beyond_limits(model, name, x_init),

@@ -405,6 +405,40 @@ def test_pairs_one_by_one_touch_as_all_at_once():
         np.testing.assert_allclose(one[orders[0]], other[orders[1]], atol=1e-12)
 
 
+CONDIMS = """
+<mujoco><worldbody><geom name="floor" type="plane" size="3 3 0.1" condim="1"/>
+  <body pos="0 0 0.099"><freejoint/><geom name="a" size="0.1" condim="3"/></body>
+  <body pos="0 0.198 0.0985"><freejoint/><geom name="b" size="0.1" condim="1"/></body>
+  <body pos="0.198 0 0.098"><freejoint/><geom name="c" size="0.1" condim="6"/></body>
+</worldbody></mujoco>"""
+
+
+def test_pairs_of_one_kind_are_one_computation_whatever_their_condim(monkeypatch):
+    model = mujoco.MjModel.from_xml_string(CONDIMS)
+    calls, of_planes = [], COLLISIONS[0, 2]
+
+    def counted(model, data, key, geom):
+        calls.append(geom.shape)
+        return of_planes(model, data, key, geom)
+
+    counted.ncon = 1
+    monkeypatch.setitem(COLLISIONS, (0, 2), counted)
+    wanted = mujoco.MjData(model)
+    mujoco.mj_forward(model, wanted)
+    with jax.enable_x64(True):
+        found = contacts_of(model)(wanted)
+    assert calls == [(3, 2)]
+    assert_touch_alike(model, found, wanted.contact, 1e-12)
+    acting = np.asarray(found.dist) < 0
+    dims = {
+        tuple(sorted(pair)): dim
+        for pair, dim in zip(wanted.contact.geom.tolist(), wanted.contact.dim, strict=True)
+    }
+    pairs = np.asarray(found.geom)[acting].tolist()
+    assert [dims[tuple(sorted(pair))] for pair in pairs] == found.dim[acting].tolist()
+    assert set(dims.values()) == {1, 3, 6}
+
+
 @pytest.mark.slow
 def test_hulls_of_other_sizes_are_one_computation_and_touch_as_each_alone():
     rng, spec = np.random.default_rng(0), mujoco.MjSpec()

@@ -10,8 +10,8 @@ import pytest
 
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
-from mjx_drax.physics import near
-from mjx_drax.physics.agreement.checks import Findings, Samples, compare, examine
+from mjx_drax.physics import near, report
+from mjx_drax.physics.agreement.checks import Findings, Samples, StepErrors, compare, examine
 from mjx_drax.physics.c_engine.states import Engine
 from mjx_drax.physics.contacts.pairs import contact_pairs, left_out
 from mjx_drax.physics.dynamics import MjxDynamics
@@ -171,17 +171,45 @@ def test_parts_of_one_robot_that_differ_may_be_left_out(monkeypatch):
     assert len(contact_points(planned)) < len(contact_points(put_model(hulls, True)))
 
 
+@pytest.mark.parametrize(
+    ("aside", "obstacle", "wanted"),
+    [(0.0, "it differs", [False, True]), (0.0, None, [False, True]), (0.5, "it differs", [True])],
+)
+def test_derivatives_are_compared_once_it_is_known_which_contacts_are_planned(
+    monkeypatch, aside, obstacle, wanted
+):
+    """Where cylinders of one robot touch (not where one is moved aside)."""
+    model, asked = crossed(), []
+    model.body_pos[3, 1] += aside
+
+    def examine(*arguments, derivatives=False):
+        asked.append(derivatives)
+        return Findings(StepErrors(np.zeros(1), 0.25), (), obstacle)
+
+    def without_own(model, name, x_init, bounded, contacts, derivatives):
+        if not asked[0]:
+            asked.append(derivatives)
+            return put_model(model), Findings(StepErrors(np.zeros(1), 0.25), (), None)
+
+    monkeypatch.setattr(report, "examine", examine)
+    monkeypatch.setattr(report, "without_own", without_own)
+    found = check(model)
+    assert asked == wanted
+    assert found["agreement"]["jacobian_error_at_x_init"] == 0.25
+    assert (found["obstacle"] is None) == (asked[0] is False)
+
+
 @pytest.mark.slow
 def test_a_robot_whose_parts_differ_is_planned_without_them():
     model = crossed()
-    report = check(model)
-    assert report["obstacle"] is None
-    assert "of 1 pairs of parts of crossed" in report["notes"][0]
+    found = check(model)
+    assert found["obstacle"] is None
+    assert "of 1 pairs of parts of crossed" in found["notes"][0]
     with pytest.warns(DraxWarning, match="of 1 pairs of parts of crossed"):
         problem = from_mjcf(model, horizon=0.1, running_cost=lambda data, u: u @ u)
     left, right = (model.geom(name).id for name in ("left", "right"))
     assert left_out(model, problem.dynamics.contacts) == {(left, right)}
-    assert report["contact_points"]["kept"] == len(contact_points(problem.dynamics.model))
+    assert found["contact_points"]["kept"] == len(contact_points(problem.dynamics.model))
     with pytest.raises(DraxError, match=r"differs .* by .* that of 'left' with 'right' differ"):
         from_mjcf(
             model, horizon=0.1, running_cost=lambda data, u: u @ u, contacts=[("left", "right")]
