@@ -5,8 +5,8 @@
   a tilted box has more contacts there.
 - Capsules on planes have the C engine's directions of friction, along and across the capsule. MJX
   has others where a capsule is steeper than 60 degrees.
-- Spheres on capsules and cylinders, and two capsules, touch where the C engine has it (`spheres`),
-  and so do spheres and capsules on boxes (`boxes`).
+- Spheres and capsules touch each other and cylinders where the C engine has it (`spheres`), and so
+  do spheres and capsules on boxes (`boxes`).
 - Meshes on planes touch with the face that the C engine has, where MJX takes corners of the whole
   hull.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
@@ -586,6 +586,7 @@ _OWN = {
     (SPHERE, CYLINDER): _of_spheres(spheres.sphere_cylinder),
     (SPHERE, BOX): _of_spheres(boxes.sphere_box),
     (CAPSULE, CAPSULE): _of_spheres(spheres.two_capsules),
+    (CAPSULE, CYLINDER): _of_spheres(spheres.capsule_cylinder, 2),
     (CAPSULE, BOX): _of_spheres(boxes.capsule_box, 2),
     (HFIELD, ELLIPSOID): on_height_field,
     (HFIELD, CYLINDER): on_height_field,
