@@ -5,8 +5,8 @@
   a tilted box has more contacts there.
 - Capsules on planes have the C engine's directions of friction, along and across the capsule. MJX
   has others where a capsule is steeper than 60 degrees.
-- Spheres and capsules touch each other and cylinders where the C engine has it (`spheres`), and so
-  do spheres and capsules on boxes (`boxes`).
+- Spheres and capsules touch each other (`spheres`), cylinders and ellipsoids (`solids`), and boxes
+  (`boxes`) where the C engine has it.
 - Meshes on planes touch with the face that the C engine has, where MJX takes corners of the whole
   hull.
 - Cylinders and ellipsoids meet boxes and meshes (`curved`), and height fields as convex hulls of
@@ -47,7 +47,7 @@ from mjx_drax.physics._mjx import (
     mjx,
     with_internal,
 )
-from mjx_drax.physics.contacts import boxes, curved, polytopes, spheres
+from mjx_drax.physics.contacts import boxes, curved, polytopes, solids, spheres
 from mjx_drax.physics.contacts.hull import Hull, hull_of, polytope
 from mjx_drax.physics.contacts.spheres import APART, Contacts
 from mjx_drax.physics.engine import mujoco
@@ -532,7 +532,7 @@ def _one_by_one(
 def _of_spheres(
     collide: Callable[[mjx.Model, mjx.Data, Array], Contacts], contacts: int = 1
 ) -> Any:
-    """A function of `spheres` or `boxes`, as MJX calls it."""
+    """A function of `spheres`, `solids` or `boxes`, as MJX calls it."""
 
     def function(model: mjx.Model, data: mjx.Data, _: Any, geom: Array) -> Contacts:
         dist, pos, normal = collide(model, data, geom)
@@ -583,10 +583,12 @@ _OWN = {
     (PLANE, BOX): plane_box,
     (PLANE, MESH): plane_mesh,
     (SPHERE, CAPSULE): _of_spheres(spheres.sphere_capsule),
-    (SPHERE, CYLINDER): _of_spheres(spheres.sphere_cylinder),
+    (SPHERE, CYLINDER): _of_spheres(solids.sphere_cylinder),
     (SPHERE, BOX): _of_spheres(boxes.sphere_box),
     (CAPSULE, CAPSULE): _of_spheres(spheres.two_capsules),
-    (CAPSULE, CYLINDER): _of_spheres(spheres.capsule_cylinder, 2),
+    (SPHERE, ELLIPSOID): _of_spheres(solids.sphere_ellipsoid),
+    (CAPSULE, ELLIPSOID): _of_spheres(solids.capsule_ellipsoid),
+    (CAPSULE, CYLINDER): _of_spheres(solids.capsule_cylinder, 2),
     (CAPSULE, BOX): _of_spheres(boxes.capsule_box, 2),
     (HFIELD, ELLIPSOID): on_height_field,
     (HFIELD, CYLINDER): on_height_field,
