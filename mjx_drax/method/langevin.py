@@ -201,7 +201,7 @@ class Langevin:
             chain = state.multipliers, weights, alpha, (to.drift, back.drift)
             new = descent.metropolis(problem, bounds, X, new, *chain, key)
         else:
-            new = bounds.confine(problem.plan_bounds, X, new)
+            new = problem.with_useful_controls(bounds.confine(problem.plan_bounds, X, new))
         moved = self._moved(state, new, jnp.asarray(alpha), to)
         if not tail:
             return moved

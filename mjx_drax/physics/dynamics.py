@@ -41,6 +41,7 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.observed import Observed
+from mjx_drax.physics.saturation import useful_controls
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
 from mjx_drax.problem.dynamics import Dynamics
@@ -286,6 +287,14 @@ class MjxDynamics(Dynamics):
             return [pair for pair in every if (min(pair), max(pair)) not in without]
         points = kept_contacts(self.model)
         return True if points is None else points
+
+    def useful_controls(self, x: Array) -> tuple[Array, Array] | None:
+        """Those at which forces reach their ranges.
+
+        None where contacts, limits or dry friction act: there chains start about the controls that
+        hold x_init.
+        """
+        return None if self.kinked else useful_controls(self.model, x)
 
     def differentiator(self, by: Any) -> Any:
         """Exact derivatives in scalar arithmetic; others as they are."""

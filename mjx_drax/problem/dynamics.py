@@ -96,6 +96,14 @@ class Dynamics:
         """
         return numbers if self.ndx == self.nx else jnp.zeros((*numbers.shape[:-1], self.ndx))
 
+    def useful_controls(self, x: Array) -> tuple[Array, Array] | None:
+        """Ends (..., nu) of controls beyond which f hardly changes at states (..., nx).
+
+        As beyond those at which an actuator gives its largest force. The search starts between
+        them, and goes back there, since f has no slope beyond. None if there are none.
+        """
+        return None
+
     def observe(self, x: Array, u: Array) -> Any:
         """What cost functions receive for the knot (x, u): here the state itself."""
         return x

@@ -114,6 +114,10 @@ class Extended(Dynamics):
         """The same at one knot."""
         return replace(self, knot=knot)
 
+    def useful_controls(self, x: Array) -> tuple[Array, Array] | None:
+        """Those of the inner dynamics."""
+        return self.inner.useful_controls(self.inner_state(x))
+
     def here(self, x: Array, u: Array) -> Knot:
         """The knot of (x', u), with all that functions may ask it for."""
         knot, own = self.knot, self.extras(x)

@@ -39,6 +39,13 @@ FUNCTIONS = ("dynamics", "running", "terminal", "constraint", "terminal_constrai
 STEP = "the dynamics f(x, u)"
 """What messages call f."""
 
+INWARD = 0.05
+"""How far inside of the useful controls the search brings those back that have left them, as a
+share of the way between their ends."""
+
+STATES = 1_000
+"""States that are looked at."""
+
 CLOSE = 0.03
 """Least factor on the scatter of initial knots of chains that start nearer to x_init."""
 
@@ -343,18 +350,55 @@ class Problem:
         x = jax.random.uniform(key_x, (self.horizon, dynamics.nx))
         u = jax.random.uniform(key_u, (self.horizon, dynamics.nu))
         x = box.x_lower + x * (box.x_upper - box.x_lower)
-        u = box.u_lower + u * (box.u_upper - box.u_lower)
         if self.near > 0.0:
             power = jax.random.uniform(jax.random.fold_in(key, 2))
             share = CLOSE ** jnp.maximum((power - (1.0 - self.near)) / self.near, 0.0)
-            middle = 0.5 * (box.u_lower + box.u_upper)
-            x, u = self.x_init + share * (x - self.x_init), middle + share * (u - middle)
-        knots = Trajectory(dynamics.valid(x), u)
+            x = self.x_init + share * (x - self.x_init)
+        x = dynamics.valid(x)
+        ends = dynamics.useful_controls(jnp.concatenate([self.x_init[None], x[:-1]]))
+        low, high = box.u_lower, box.u_upper
+        if ends is not None:
+            low, high = (jnp.clip(end, box.u_lower, box.u_upper) for end in ends)
+        u = low + u * (high - low)
+        if self.near > 0.0:
+            middle = 0.5 * (low + high)
+            u = middle + share * (u - middle)
+        knots = Trajectory(x, u)
         lower, upper = box.start_lower, box.start_upper
         if lower is not None and upper is not None:
             share = jax.random.uniform(jax.random.fold_in(key, 3), lower.shape)
             knots = replace(knots, start=lower + share * (upper - lower))
         return dynamics.consistent(knots)
+
+    @property
+    def saturates(self) -> bool:
+        """Whether some controls between the bounds are of no more use than others.
+
+        In one of a thousand states of the scatter box; see `Dynamics.useful_controls`.
+        """
+        box, bounds = self.scatter, self.bounds
+        low, high = np.min(np.atleast_2d(box.x_lower), 0), np.max(np.atleast_2d(box.x_upper), 0)
+        share = np.random.default_rng(0).random((STATES, len(low)))
+        x = jnp.asarray(low + share * (high - low), self.x_init.dtype)
+        ends = self.dynamics.useful_controls(self.dynamics.valid(x))
+        if ends is None:
+            return False
+        lower, upper = (
+            np.min(np.atleast_2d(bounds.u_lower), 0),
+            np.max(np.atleast_2d(bounds.u_upper), 0),
+        )
+        return bool(((ends[0] > lower) | (ends[1] < upper)).any())
+
+    def with_useful_controls(self, knots: Trajectory) -> Trajectory:
+        """The knots with controls at which f has slopes; see `Dynamics.useful_controls`."""
+        ends = self.dynamics.useful_controls(self.stages(knots)[0])
+        if ends is None:
+            return knots
+        width = ends[1] - ends[0]
+        inward = jnp.where(jnp.isfinite(width), INWARD * width, 0.0)
+        u, bounds = jnp.clip(knots.u, ends[0] + inward, ends[1] - inward), self.plan_bounds
+        inside = (u > bounds.u_lower) & (u < bounds.u_upper)
+        return replace(knots, u=jnp.where(inside, u, knots.u))
 
     def started(self, knots: Trajectory) -> Trajectory:
         """Given knots as states of the dynamics, with the x_0 next to x_init where it is free.

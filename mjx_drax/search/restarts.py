@@ -130,8 +130,9 @@ class Restarts:
         heated: whether attempts after the first may be heated, or all descend like the first. None:
             they may; where f has kinks it stays None, and a single problem's are heated in turns
             with others until a chain is done.
-        rollouts: what follows an attempt. None: `Rollouts()` where f has kinks and an attempt ends
-            with as many iterations as a round has, else nothing.
+        rollouts: what follows an attempt. None: `Rollouts()` where f has kinks, or controls can be
+            beyond what `Dynamics.useful_controls` says, and an attempt ends with as many iterations
+            as a round has, else nothing.
         polish: what follows the noise, instead of the flow's tail. It brings defects to 0, so the
             flow's penalty goes half its way only: softer dynamics lead to better basins. None:
             `Polish()` with the tolerance of the precision, unless derivatives are sampled or the
@@ -193,7 +194,9 @@ class Restarts:
     def for_problem(self, problem: Problem, chains: int) -> Restarts:
         """The same settings, with a value for each that is None."""
         kinked, polish = problem.dynamics.kinked, self.polish or self._polish_for(problem)
-        rolled_out = kinked and replace(self, polish=polish).after >= Rollouts.iterations
+        # Where forces are at the ends of their ranges, f has no slope that leads on
+        blind = kinked or problem.saturates
+        rolled_out = blind and replace(self, polish=polish).after >= Rollouts.iterations
         values: dict[str, Any] = {
             "within": WITHIN_KINKED if kinked else WITHIN,
             "done_share": DONE_SHARE_KINKED if kinked else DONE_SHARE,

@@ -351,9 +351,12 @@ class Results:
         """What is known of the best chain's optimality, in words."""
         best, problem = self.best_chain, self.problem
         words = self.optimality_of(best)
+        if self.polished[best] != STALLED:
+            return words
+        if problem.saturates:
+            return f"{words}; forces at the ends of their ranges (forcerange) may keep it there"
         rounded = problem.precision == 32 and not problem.dynamics.kinked
-        more = self.polished[best] == STALLED and rounded
-        return f"{words}; precision=64 may get further" if more else words
+        return f"{words}; precision=64 may get further" if rounded else words
 
     def optimality_of(self, chain: int) -> str:
         """What the residual of a chain says, in words, and if it is small for another motion."""
