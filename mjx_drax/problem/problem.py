@@ -340,6 +340,7 @@ class Problem:
         towards x_init and the middle of the controls, for each by another factor from `CLOSE` to 1,
         uniform in its logarithm: far from x_init bodies overlap, forces become huge, and what
         floats freely may tumble at any speed. Chains that start far away find motions that go far.
+        Controls stay within the useful ones of the state before; see `Dynamics.useful_controls`.
         """
         if self.guess is not None:
             knots = self.guess(key)
