@@ -34,6 +34,11 @@ def add_problem(parser: argparse.ArgumentParser) -> None:
 def require_known(options: argparse.Namespace) -> None:
     """Answer a wrong task's name at once, before heavy imports."""
     if options.task is not None:
+        if options.task.endswith((".xml", ".urdf")):
+            raise DraxError(
+                f"{options.task!r} stands where a task's name does: give a model of your own as "
+                f"--model {options.task}, with --cost PY."
+            )
         tasks.full_name(options.task)
 
 

@@ -55,7 +55,7 @@ DIVERGED, INTERRUPTED = "diverged", "interrupted"
 
 CONVERGED, STALLED, UNFINISHED, UNPOLISHED = "converged", "stalled", "unfinished", "none"
 
-SAME_COST = 1e-4
+SAME_COST = 1e-3
 """Share of a cost by which another one counts as the same."""
 
 RESIDUAL = 1e-4
@@ -236,7 +236,8 @@ class Results:
     def best_chain(self) -> int:
         """The certified chain with the cheapest replay; else a feasible, or the least infeasible.
 
-        Of certified chains that cost as much, up to 1e-4 of it, an optimal one. Plans of feasible
+        Of certified chains that cost as much, up to 1e-3 of it, an optimal one: others may use what
+        tolerances of constraints allow. Plans of feasible
         chains say little where a replay does not follow them: there replays are compared, too.
         """
         if self.certified_chains.any():

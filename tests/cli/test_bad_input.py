@@ -37,6 +37,7 @@ COMMANDS = [
     ("option", lambda at: ["solve", "pendulum", "--chain-count", "3"], "--chain-count"),
     ("nothing-to-solve", lambda at: ["solve"], "give a task"),
     ("task", lambda at: ["solve", "pendulumm"], "pendulumm", "pendulum_swingup"),
+    ("model-as-task", lambda at: ["solve", "a.xml", "--cost", "c.py"], "--model a.xml"),
     ("task-and-model", task("--model", "a.xml"), "choose one"),
     ("chains-0", task("--chains", "0"), "--chains", "'0'", "whole number"),
     ("chains-text", task("--chains", "many"), "--chains", "'many'"),

@@ -303,6 +303,15 @@ def test_a_constraint_that_a_replay_breaks_is_told_everywhere(tmp_path):
     assert replayed(reaches_not, X, U).outcome(problem, 0) == f"misses the goal and {broken}"
 
 
+@pytest.mark.parametrize(("saved", "best"), [(0.0, 1), (8e-4, 1), (2e-3, 0)])
+def test_an_optimal_chain_is_best_among_those_that_cost_as_much(saved, best):
+    made = replace(made_up(point(), 2), residual=np.array([np.nan, 1e-6]))
+    cheaper = replace(made.open_loop, cost=np.array([1.0 - saved, 1.0]))
+    made = replace(made, open_loop=cheaper, feedback=cheaper)
+    assert made.certified_chains.all()
+    assert made.best_chain == best
+
+
 def test_optimal_is_certified_with_a_small_residual():
     made = replace(made_up(point(), 4), residual=np.array([1e-6, 1e-2, np.nan, 1e-6]))
     failed = replace(made.open_loop, success=np.arange(4) < 3)
