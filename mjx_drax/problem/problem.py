@@ -44,7 +44,7 @@ INWARD = 0.05
 share of the way between their ends."""
 
 STATES = 1_000
-"""States that are looked at."""
+"""States of the scatter box in which `Problem.saturates` looks."""
 
 CLOSE = 0.03
 """Least factor on the scatter of initial knots of chains that start nearer to x_init."""
@@ -373,25 +373,26 @@ class Problem:
 
     @property
     def saturates(self) -> bool:
-        """Whether some controls between the bounds are of no more use than others.
+        """Whether bounds hold controls that are not useful, in one of `STATES` states at least.
 
-        In one of a thousand states of the scatter box; see `Dynamics.useful_controls`.
+        See `Dynamics.useful_controls`. Compiled only where there are such controls.
         """
+        if jax.eval_shape(self.dynamics.useful_controls, self.x_init) is None:
+            return False
         box, bounds = self.scatter, self.bounds
         low, high = np.min(np.atleast_2d(box.x_lower), 0), np.max(np.atleast_2d(box.x_upper), 0)
         share = np.random.default_rng(0).random((STATES, len(low)))
         x = jnp.asarray(low + share * (high - low), self.x_init.dtype)
-        ends = self.dynamics.useful_controls(self.dynamics.valid(x))
-        if ends is None:
-            return False
-        lower, upper = (
-            np.min(np.atleast_2d(bounds.u_lower), 0),
-            np.max(np.atleast_2d(bounds.u_upper), 0),
-        )
-        return bool(((ends[0] > lower) | (ends[1] < upper)).any())
+        first, last = jax.jit(lambda x: self.dynamics.useful_controls(self.dynamics.valid(x)))(x)
+        lower = np.min(np.atleast_2d(bounds.u_lower), 0)
+        upper = np.max(np.atleast_2d(bounds.u_upper), 0)
+        return bool(((first > lower) | (last < upper)).any())
 
     def with_useful_controls(self, knots: Trajectory) -> Trajectory:
-        """The knots with controls at which f has slopes; see `Dynamics.useful_controls`."""
+        """The knots, with u_k clipped to the useful controls of x_k, less `INWARD` at each end.
+
+        Controls for which that is outside of the bounds stay; see `Dynamics.useful_controls`.
+        """
         ends = self.dynamics.useful_controls(self.stages(knots)[0])
         if ends is None:
             return knots

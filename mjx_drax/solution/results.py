@@ -237,8 +237,8 @@ class Results:
         """The certified chain with the cheapest replay; else a feasible, or the least infeasible.
 
         Of certified chains that cost as much, up to 1e-3 of it, an optimal one: others may use what
-        tolerances of constraints allow. Plans of feasible
-        chains say little where a replay does not follow them: there replays are compared, too.
+        tolerances of constraints allow. Plans of feasible chains say little where a replay does not
+        follow them: there replays are compared, too.
         """
         if self.certified_chains.any():
             least = self.replay_cost[self.certified_chains].min()

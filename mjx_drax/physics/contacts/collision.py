@@ -232,7 +232,8 @@ def collision(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _whatever_condim(model: mjx.Model, data: mjx.Data) -> dict[tuple[int, int], Any]:
     """Functions for kinds of geoms that MJX would collide once for each condim.
 
-    They know their results: to compile a hand's contacts takes less than two thirds of the time.
+    They know their results. One step of a hand with its derivatives then compiles on a CPU in 60 %
+    of the time.
     """
     alike: dict[Any, dict[Any, np.ndarray]] = {}
     for key, pairs in collision_driver._geom_groups(model).items():
@@ -242,10 +243,9 @@ def _whatever_condim(model: mjx.Model, data: mjx.Data) -> dict[tuple[int, int], 
     for kind, parts in alike.items():
         collide = COLLISIONS[kind.types]
         every = collide(model, data, kind, jnp.concatenate([*parts.values()]))
-        ends = np.cumsum([collide.ncon * len(pairs) for pairs in parts.values()])
-        known |= zip(
-            parts, zip(*(jnp.split(a, ends[:-1]) for a in every), strict=True), strict=True
-        )
+        ends = np.cumsum([collide.ncon * len(pairs) for pairs in parts.values()])[:-1]
+        of_each = zip(*(jnp.split(array, ends) for array in every), strict=True)
+        known |= zip(parts, of_each, strict=True)
 
     def found(_: mjx.Model, __: mjx.Data, key: Any, ___: Array) -> Contacts:
         return known[key]
@@ -585,8 +585,8 @@ _OWN = {
     (SPHERE, CAPSULE): _of_spheres(spheres.sphere_capsule),
     (SPHERE, CYLINDER): _of_spheres(solids.sphere_cylinder),
     (SPHERE, BOX): _of_spheres(boxes.sphere_box),
-    (CAPSULE, CAPSULE): _of_spheres(spheres.two_capsules),
     (SPHERE, ELLIPSOID): _of_spheres(solids.sphere_ellipsoid),
+    (CAPSULE, CAPSULE): _of_spheres(spheres.two_capsules),
     (CAPSULE, ELLIPSOID): _of_spheres(solids.capsule_ellipsoid),
     (CAPSULE, CYLINDER): _of_spheres(solids.capsule_cylinder, 2),
     (CAPSULE, BOX): _of_spheres(boxes.capsule_box, 2),
