@@ -190,10 +190,7 @@ class Langevin:
     def diffuse(
         self, problem: Problem, state: State, model: Model, to: Direction, key: Array, tail: bool
     ) -> State:
-        """X + alpha d + sigma sqrt(2 alpha) n, inside of the bounds, and lambda + alpha r.
-
-        Controls beyond the useful ones are brought back; no dynamics of the paper has such.
-        """
+        """X + alpha d + sigma sqrt(2 alpha) n, in bounds, of useful controls; lambda + alpha r."""
         alpha, X, bounds, weights = self.step_size, state.trajectory, self.bounds, model.weights
         sigma = weights.noise * jnp.sqrt(2.0 * alpha)
         change = jax.tree.map(lambda d, n: alpha * d + sigma * n, to.drift, to.noise)
