@@ -49,8 +49,10 @@ class Arithmetic:
         simpler = self.simplified(name, operands, params)
         if simpler is not None:
             return simpler
-        if name in NUMPY and all(is_known(operand) for operand in operands):
-            return apply_to_known(name, operands, params)
+        if all(is_known(operand) for operand in operands):
+            if name in NUMPY:
+                return apply_to_known(name, operands, params)
+            return bound_to_known(primitive, operands, params)[0][()]
         names = [key_of(operand) for operand in operands]
         if name in ("add", "mul", "add_any", "max", "min"):
             names.sort()
@@ -239,3 +241,15 @@ def apply_to_known(name: str, operands: Sequence[Any], params: dict[str, Any]) -
         out = NUMPY[name](*operands)
     dtype = params.get("new_dtype", out.dtype if out.dtype == bool else operands[-1].dtype)
     return np.asarray(out).astype(dtype)[()]
+
+
+def bound_to_known(
+    primitive: Any, operands: Sequence[Any], params: dict[str, Any]
+) -> list[np.ndarray]:
+    """The outputs of a primitive that numpy has no function for: JAX computes them now.
+
+    Left to a kernel, an operation of numbers alone would not compile for a GPU.
+    """
+    with jax.ensure_compile_time_eval():
+        out = primitive.bind(*map(jax.numpy.asarray, operands), **params)
+    return [np.asarray(o) for o in (out if primitive.multiple_results else [out])]

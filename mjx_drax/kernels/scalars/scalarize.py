@@ -42,6 +42,7 @@ from mjx_drax.kernels.scalars.arithmetic import (
     array_of,
     as_numbers,
     as_objects,
+    bound_to_known,
     entries_of,
     is_known,
     is_numeric,
@@ -227,10 +228,7 @@ class _Evaluation(Arithmetic):
             if name not in UNROLLED or not all(value.size for value in values):
                 if not all(is_numeric(aval.dtype) for aval in avals):
                     raise Unsupported("keys")
-                with jax.ensure_compile_time_eval():
-                    out = equation.primitive.bind(*map(jax.numpy.asarray, values), **params)
-                several = equation.primitive.multiple_results
-                return [np.asarray(o) for o in (out if several else [out])]
+                return bound_to_known(equation.primitive, values, params)
         if name in ELEMENTWISE:
             columns = [entries_of(np.broadcast_to(as_objects(value), shape)) for value in values]
             scalars = [

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.extend.core import Literal
 
 from mjx_drax.kernels.pruning import pruned
 from mjx_drax.kernels.scalars import scalarize
@@ -299,6 +300,28 @@ def test_kernels_write_each_number_once_and_none_that_is_known(strictly, on_gpu,
         seen = jax.jit(jax.vmap(scalarized(function, outermost=True)))(x)
         close(seen, jax.vmap(function)(x), 1e-6)
     assert written == {3}
+
+
+def test_kernels_compute_nothing_of_numbers_alone(strictly, on_gpu, monkeypatch):
+    """Pallas cannot lower integer_pow of a number, for one."""
+    seen, as_kernel = [], scalarize.vmapped_as_kernel
+
+    def watched(program):
+        seen.extend(program.eqns)
+        return as_kernel(program)
+
+    def partly_known(x):
+        return jnp.concatenate([x, np.float32([3.0, 0.5])]) ** 5
+
+    monkeypatch.setattr(scalarize, "vmapped_as_kernel", watched)
+    x = jnp.asarray(A, jnp.float32)[:, :2]
+    close(
+        jax.jit(jax.vmap(scalarized(partly_known, outermost=True)))(x),
+        jax.vmap(partly_known)(x),
+        1e-5,
+    )
+    assert {e.primitive.name for e in seen} == {"integer_pow"}
+    assert not any(all(isinstance(v, Literal) for v in e.invars) for e in seen)
 
 
 @pytest.mark.parametrize("name", sorted(IN_KERNELS))
