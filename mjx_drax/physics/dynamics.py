@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.tree_util import Partial
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import HostOnly
@@ -41,10 +42,10 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.observed import Observed
-from mjx_drax.physics.saturation import useful_controls
+from mjx_drax.physics.saturation import Ends, ends_of, unlimited, useful_controls
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
-from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.dynamics import Dynamics, Unlimited
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.rollout import replay_by
 from mjx_drax.problem.trajectory import Knot
@@ -295,6 +296,22 @@ class MjxDynamics(Dynamics):
         hold x_init.
         """
         return None if self.kinked else useful_controls(self.model, x)
+
+    def unlimited(self) -> Unlimited[MjxDynamics] | None:
+        """The same with `saturation.unlimited` actuators; the C engine keeps the model as it is."""
+        at_once = ends_of(self.model)
+        at_once = None if at_once is None else at_once.finite()
+        all_along = ends_of(self.model, float(self.dt))
+        all_along = None if all_along is None else all_along.finite()
+        if at_once is None or all_along is None:
+            return None
+        return Unlimited(
+            replace(self, model=unlimited(self.model, at_once)),
+            useful=partial(useful_controls, self.model),
+            at_once=Partial(Ends.passed, at_once),
+            all_along=Partial(Ends.passed, all_along),
+            rows=2 * len(at_once.actuators),
+        )
 
     def differentiator(self, by: Any) -> Any:
         """Exact derivatives in scalar arithmetic; others as they are."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
@@ -15,13 +19,62 @@ _FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
 _LINEAR = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 _JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
+UNLIMITED = 1e6
+"""So many times their largest forces actuators give in `unlimited`."""
 
-def useful_controls(model: mjx.Model, x: Array) -> tuple[Array, Array] | None:
-    """Ends (..., nu) of the controls at which forces reach their ranges, at states (..., nx).
+FASTER = 20.0
+"""How much faster than `dof_M0` says joints may gain speed: it is that of one posture, without what
+hits or carries them. With 2 the swing-up of a servo cost up to 1.3 times as much."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Ends:
+    """Controls at which forces reach their ranges: of motors and servos of hinges and slides.
+
+        u = low, high + by_q q + by_v v
+
+    Attributes:
+        actuators: their numbers.
+        q, v: where the positions and velocities of their joints are in qpos and qvel.
+        low, high, by_q, by_v: (n,).
+    """
+
+    actuators: tuple[int, ...] = field(metadata=Static)
+    q: tuple[int, ...] = field(metadata=Static)
+    v: tuple[int, ...] = field(metadata=Static)
+    low: Array
+    high: Array
+    by_q: Array
+    by_v: Array
+
+    def at(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        """The ends (..., n)."""
+        change = self.by_q * qpos[..., list(self.q)] + self.by_v * qvel[..., list(self.v)]
+        return self.low + change, self.high + change
+
+    def finite(self) -> Ends | None:
+        """Those that are finite at both ends, on the host; None if none are."""
+        (some,) = np.nonzero(np.isfinite(self.low) & np.isfinite(self.high))
+        if not some.size:
+            return None
+        own, q, v = (tuple(np.array(n)[some].tolist()) for n in (self.actuators, self.q, self.v))
+        return Ends(own, q, v, self.low[some], self.high[some], self.by_q[some], self.by_v[some])
+
+    def passed(self, data: Any, u: Array) -> Array:
+        """By how much controls are beyond the ends, (2 n,): positive if they are."""
+        low, high = self.at(data.qpos, data.qvel)
+        own = u[jnp.array(self.actuators)]
+        return jnp.concatenate([own - high, low - own])
+
+
+def ends_of(model: mjx.Model, time: float = 0.0) -> Ends | None:
+    """Where forces reach their ranges; None if they have none.
 
         gain u + b_0 + b_1 gear q + b_2 gear v = an end of the range, of the actuator or its joint
 
-    For motors and servos of hinges and slides; infinite for others, and None if there are none.
+    Of a control that is held for some time [s]: where the force is still there at its end. The
+    joint has gone on then, and has gained speed by force / `dof_M0`, times FASTER.
     """
     joint = np.asarray(model.actuator_trnid)[:, 0]
     single = np.isin(model.actuator_trntype, _JOINTS)
@@ -31,22 +84,63 @@ def useful_controls(model: mjx.Model, x: Array) -> tuple[Array, Array] | None:
     single &= np.asarray(model.actuator_gaintype) == _FIXED
     single &= np.isin(model.actuator_biastype, _LINEAR)
     own = np.asarray(model.actuator_forcelimited).astype(bool)
-    of_joint = np.asarray(model.jnt_actfrclimited).astype(bool)[joint]
-    single &= own | of_joint
-    if not single.any():
+    of_joint = np.asarray(model.jnt_actfrclimited).astype(bool)[joint] if model.njnt else own
+    (which,) = np.nonzero(single & (own | of_joint))
+    if not which.size:
         return None
-    gear, gain = model.actuator_gear[:, 0], model.actuator_gainprm[:, 0]
-    single = single & (gain != 0) & (gear != 0)
-    gain, across = jnp.where(single, gain, 1.0), jnp.where(single, gear, 1.0)
-    low, high = jnp.where(own[:, None], model.actuator_forcerange, jnp.array([-jnp.inf, jnp.inf])).T
-    ends = model.jnt_actfrcrange[joint] / across[:, None]
-    ends = jnp.where(of_joint[:, None], jnp.sort(ends, axis=1), jnp.array([-jnp.inf, jnp.inf]))
-    low, high = jnp.maximum(low, ends[:, 0]), jnp.minimum(high, ends[:, 1])
-    q = x[..., np.asarray(model.jnt_qposadr)[joint]]
-    v = x[..., model.nq + np.asarray(model.jnt_dofadr)[joint]]
-    bias = model.actuator_biasprm
-    force = bias[:, 0] + gear * (bias[:, 1] * q + bias[:, 2] * v)
-    force = jnp.where(np.asarray(model.actuator_biastype) == _LINEAR[0], 0.0, force)
-    one, other = (low - force) / gain, (high - force) / gain
-    lower = jnp.where(single, jnp.minimum(one, other), -jnp.inf)
-    return lower, jnp.where(single, jnp.maximum(one, other), jnp.inf)
+    joint, own, of_joint = joint[which], own[which, None], of_joint[which, None]
+    q, v = np.asarray(model.jnt_qposadr)[joint], np.asarray(model.jnt_dofadr)[joint]
+    gear, gain = model.actuator_gear[which, 0], model.actuator_gainprm[which, 0]
+    idle = (gain == 0) | (gear == 0)
+    gain, across = jnp.where(idle, 1.0, gain), jnp.where(idle, 1.0, gear)
+    free = np.asarray(model.actuator_biastype)[which] == _LINEAR[0]
+    bias = jnp.where(free[:, None], 0.0, model.actuator_biasprm[which])
+    by_q, by_v = (-bias[:, i] * gear / gain for i in (1, 2))
+
+    everything = jnp.array([-jnp.inf, jnp.inf])
+    ranges = jnp.where(own, model.actuator_forcerange[which], everything)
+    of_joints = jnp.sort(model.jnt_actfrcrange[joint] / across[:, None], axis=1)
+    of_joints = jnp.where(of_joint, of_joints, everything)
+    low = jnp.where(idle, -jnp.inf, jnp.maximum(ranges[:, 0], of_joints[:, 0]))
+    high = jnp.where(idle, jnp.inf, jnp.minimum(ranges[:, 1], of_joints[:, 1]))
+
+    def control(force: Array) -> Array:
+        speed = time * FASTER * gear * jnp.where(idle, 0.0, force) / model.dof_M0[v]
+        return (force - bias[:, 0]) / gain + by_v * speed
+
+    turned, (one, other) = gain < 0, (control(low), control(high))
+    own_numbers, q_places, v_places = (tuple(n.tolist()) for n in (which, q, v))
+    return Ends(
+        own_numbers,
+        q_places,
+        v_places,
+        low=jnp.where(turned, other, one),
+        high=jnp.where(turned, one, other),
+        by_q=by_q,
+        by_v=by_v + time * by_q,
+    )
+
+
+def useful_controls(model: mjx.Model, x: Array) -> tuple[Array, Array] | None:
+    """The ends (..., nu) at states (..., nx), infinite where there are none; None if all are."""
+    ends = ends_of(model)
+    if ends is None:
+        return None
+    which = np.array(ends.actuators)
+    found = ends.at(x[..., : model.nq], x[..., model.nq : model.nq + model.nv])
+    blank = jnp.full((*x.shape[:-1], model.nu), jnp.inf)
+    return (-blank).at[..., which].set(found[0]), blank.at[..., which].set(found[1])
+
+
+def unlimited(model: mjx.Model, ends: Ends) -> mjx.Model:
+    """The model with UNLIMITED times the ranges of these actuators, and of their joints."""
+    which = list(ends.actuators)
+    joints = np.asarray(model.actuator_trnid)[which, 0].tolist()
+
+    def scaled(ranges: Array, which: list[int]) -> Array:
+        return jnp.asarray(ranges).at[jnp.array(which)].multiply(UNLIMITED)
+
+    return model.replace(
+        actuator_forcerange=scaled(model.actuator_forcerange, which),
+        jnt_actfrcrange=scaled(model.jnt_actfrcrange, joints),
+    )

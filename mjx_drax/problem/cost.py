@@ -164,6 +164,7 @@ class Constraint:
         equality, inequality: the functions.
         equalities, inequalities: their rows.
         unit: what plans measure each row in, (rows,); None: as the user has them.
+        further: more inequalities, after the others; see `with_inequality`.
     """
 
     equality: Partial | None
@@ -171,10 +172,12 @@ class Constraint:
     equalities: int = field(metadata=Static)
     inequalities: int = field(metadata=Static)
     unit: Array | None = None
+    further: Partial | None = None
 
     def __call__(self, *arguments: Any) -> Array:
-        """Both parts in one vector, (equalities + inequalities,)."""
-        parts = [p for p in (self.equality, self.inequality) if p is not None]
+        """All parts in one vector, (equalities + inequalities,)."""
+        every = (self.equality, self.inequality, self.further)
+        parts = [p for p in every if p is not None]
         return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(p(*arguments)) for p in parts)])
 
     def in_units(self, values: Array) -> Array:
@@ -195,6 +198,10 @@ class Constraint:
     def rows(self) -> int:
         """Of both parts."""
         return self.equalities + self.inequalities
+
+    def with_inequality(self, further: Partial, rows: int) -> Constraint:
+        """The same and further(...) <= 0, which has so many rows, after all others."""
+        return replace(self, further=further, inequalities=self.inequalities + rows)
 
     def with_slack(self, values: Array, slack: Array) -> Array:
         """The equality constraints [equality; inequality + slack], for values (..., m)."""

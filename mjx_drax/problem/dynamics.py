@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Generic, Self, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,29 @@ from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.problem import rollout
 from mjx_drax.problem.cost import at_knot, in_float64
 from mjx_drax.problem.trajectory import Knot, Trajectory
+
+System = TypeVar("System")
+
+
+@dataclass(frozen=True)
+class Unlimited(Generic[System]):
+    """A system whose actuators give any force, and where those of the true one have ends.
+
+    Attributes:
+        dynamics: the system.
+        useful: the ends (..., nu) of controls of use at states (..., nx); see `useful_controls`.
+        at_once: by how much controls of a stage are beyond the ends, from what functions of a stage
+            are called with, (rows,): no force then leaves its range as the knot begins.
+        all_along: the same of controls at whose ends forces are largest until the next knot: no
+            motion needs controls beyond.
+        rows: of both.
+    """
+
+    dynamics: System
+    useful: Callable[[Array], tuple[Array, Array] | None]
+    at_once: Partial
+    all_along: Partial
+    rows: int
 
 
 class Dynamics:
@@ -101,6 +124,13 @@ class Dynamics:
 
         As beyond those at which an actuator gives its largest force. The search starts between
         them, and goes back there, since f has no slope beyond. None if there are none.
+        """
+        return None
+
+    def unlimited(self) -> Unlimited[Self] | None:
+        """The same system with actuators whose forces have no ends, if they are in the way.
+
+        f then has a slope wherever controls are. None if no controls of use end, as by default.
         """
         return None
 

@@ -373,17 +373,21 @@ class Problem:
 
     @property
     def saturates(self) -> bool:
-        """Whether bounds hold controls that are not useful, in one of `STATES` states at least.
+        """Whether bounds hold controls that are not useful; see `Dynamics.useful_controls`."""
+        return self.holds_beyond(self.dynamics.useful_controls)
 
-        See `Dynamics.useful_controls`. Compiled only where there are such controls.
+    def holds_beyond(self, useful: Callable[[Array], tuple[Array, Array] | None]) -> bool:
+        """Whether bounds hold controls beyond useful ones, in one of `STATES` states at least.
+
+        Compiled only where these have ends.
         """
-        if jax.eval_shape(self.dynamics.useful_controls, self.x_init) is None:
+        if jax.eval_shape(useful, self.x_init) is None:
             return False
         box, bounds = self.scatter, self.bounds
         low, high = np.min(np.atleast_2d(box.x_lower), 0), np.max(np.atleast_2d(box.x_upper), 0)
         share = np.random.default_rng(0).random((STATES, len(low)))
         x = jnp.asarray(low + share * (high - low), self.x_init.dtype)
-        first, last = jax.jit(lambda x: self.dynamics.useful_controls(self.dynamics.valid(x)))(x)
+        first, last = jax.jit(lambda x: useful(self.dynamics.valid(x)))(x)
         lower = np.min(np.atleast_2d(bounds.u_lower), 0)
         upper = np.max(np.atleast_2d(bounds.u_upper), 0)
         return bool(((first > lower) | (last < upper)).any())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
+from itertools import count
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.units import to_units
+from mjx_drax.search.unlimited import both_of, found_in_steps
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.progress import reporting
@@ -122,7 +124,12 @@ def solve(
         if record is not None and record.attempts:
             raise DraxError("record is a recorder that has recorded a solve: make another one.")
         given = warm_of(guess, problem, chains) if isinstance(guess, Solution) else guess
-        known = Checkpoint(checkpoint) if checkpoint is not None else None
+
+        def saved(step: int) -> Checkpoint | None:
+            if checkpoint is None:
+                return None
+            return Checkpoint(f"{os.fspath(checkpoint)}.{step + 1}" if step else checkpoint)
+
         most = math.inf if max_seconds is None else max_seconds
 
         spent = [0.0, 0.0]  # compiling and solving
@@ -131,22 +138,40 @@ def solve(
         def solved(problem: Problem) -> Answer[Solution]:
             first = spent == [0.0, 0.0]
             recorder = record if first or record is None else Recorder(record.every)
-            search = Search(
-                Family.of_one(problem),
-                chains,
-                seed,
-                settings,
-                mesh=mesh_for(chains, devices),
-                guess=given,
-                checkpoint=known if first else None,
-                recorder=recorder,
-                seconds=most - spent[1],
-            )
-            report = reporting(progress, problem.name)
-            with report as search.progress, said_plainly(f"the solve of {problem.name}"):
-                found = search.run()
-            spent[:] = spent[0] + found.compile_time, spent[1] + found.solve_time
-            solution = _certified(search.family.problem, settings, seed, found, tolerances)
+            report, step = reporting(progress, problem.name), count()
+            ended: list[bool] = []  # what follows an interrupted search does not go on
+
+            def searched(
+                posed: Problem, settings: Restarts, warm: Warm | None
+            ) -> tuple[Search, Found]:
+                n = next(step)
+                search = Search(
+                    Family.of_one(posed),
+                    chains,
+                    seed,
+                    settings,
+                    mesh=mesh_for(chains, devices),
+                    guess=given if warm is None else warm,
+                    checkpoint=saved(n) if first else None,
+                    recorder=None if n else recorder,
+                    seconds=0.0 if ended else most - spent[1],
+                )
+                with report as search.progress, said_plainly(f"the solve of {problem.name}"):
+                    found = search.run()
+                spent[:] = spent[0] + found.compile_time, spent[1] + found.solve_time
+                ended.extend([True] * found.interrupted)
+                return search, found
+
+            # No chain may end worse than a guess; and without a polish, the flow is as it was asked
+            polish = settings.polish
+            in_steps = given is None and polish is not None and polish.iterations
+            both = both_of(problem) if in_steps else None
+            if both is None:
+                search, found = searched(problem, settings, None)
+                problem = search.family.problem
+            else:
+                problem, found = found_in_steps(problem, both, settings, searched)
+            solution = _certified(problem, settings, seed, found, tolerances)
             if recorder is not None:
                 solution = replace(solution, recording=recorder.recording())
             best = solution.best_chain

@@ -95,13 +95,20 @@ def pusht(path: Path) -> Problem:
     )
 
 
-def arm(start: Sequence[float], path: Path) -> Problem:
-    """Turns its hand by 70 degrees about the base, around a ball in the middle of the way."""
-    model, home = load(path), np.array(start)
+def arm(path: Path, hand: str = "right_hand", start: Sequence[float] | None = None) -> Problem:
+    """Turns its hand by 70 degrees about the base, around a ball in the middle of the way.
+
+    From the first keyframe if no start is given. Of motors torques cost most; controls of servos
+    are angles, and velocities cost.
+    """
+    model = load(path)
+    home = np.array(model.key_qpos[0] if start is None else start)
     turned = home + np.eye(len(home))[0] * np.deg2rad(70)
-    (_, middle, end), hand = _hands(model, np.linspace(home, turned, 3)), "right_hand"
-    on, half = Terms(model), 0.5 * np.ptp(model.actuator_ctrlrange, axis=1)
-    links = tuple(range(2, model.nbody))
+    (_, middle, end), on = _poses(model, hand, np.linspace(home, turned, 3)), Terms(model)
+    links, half = tuple(range(2, model.nbody)), 0.5 * np.ptp(model.actuator_ctrlrange, axis=1)
+    running = on.control(weight=1e-2 / half**2) + on.velocity(weight=1e-3)
+    if (model.actuator_biastype != 0).any():
+        running = on.velocity(weight=1e-2)
 
     def there(data: mujoco.MjData) -> bool:
         off = np.linalg.norm(data.body(hand).xpos - end[0])
@@ -113,7 +120,7 @@ def arm(start: Sequence[float], path: Path) -> Problem:
         horizon=1.2,
         dt=0.02,
         x_init=np.concatenate([home, np.zeros(model.nv)]),
-        running_residual=on.control(weight=1e-2 / half**2) + on.velocity(weight=1e-3),
+        running_residual=running,
         terminal_residual=on.body(hand, *end, weight=1e3) + on.velocity(weight=10.0),
         inequality=Partial(_too_near, links, middle[0]),
         contacts=False,
@@ -127,12 +134,14 @@ def _too_near(links: tuple[int, ...], ball: np.ndarray, data: Any, u: Array) -> 
     return (0.15**2 - squared) / 0.3
 
 
-def _hands(model: mujoco.MjModel, postures: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Position and quaternion of the hand in each posture (n, nq)."""
+def _poses(
+    model: mujoco.MjModel, body: str, postures: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Position and quaternion of a body in each posture (n, nq)."""
     data, found = mujoco.MjData(model), []
     for data.qpos[:] in postures:
         mujoco.mj_kinematics(model, data)
-        found.append((data.body("right_hand").xpos.copy(), data.body("right_hand").xquat.copy()))
+        found.append((data.body(body).xpos.copy(), data.body(body).xquat.copy()))
     return found
 
 
@@ -274,9 +283,22 @@ TASKS: dict[str, tuple[str, Callable[[Path], Problem]]] = {
     "walker": ("hydrax/models/walker/scene.xml", walker),
     "crane": ("hydrax/models/crane/scene.xml", crane),
     "pusht": ("hydrax/models/pusht/scene.xml", pusht),
-    "panda": (f"{_ARMS}/panda/robot.xml", partial(arm, PANDA)),
-    "ur5e": (f"{_ARMS}/ur5e/robot.xml", partial(arm, UR5E)),
-    "iiwa": (f"{_ARMS}/iiwa/robot.xml", partial(arm, IIWA)),
+    "panda": (f"{_ARMS}/panda/robot.xml", partial(arm, start=PANDA)),
+    "ur5e": (f"{_ARMS}/ur5e/robot.xml", partial(arm, start=UR5E)),
+    "iiwa": (f"{_ARMS}/iiwa/robot.xml", partial(arm, start=IIWA)),
+    "panda_servos": ("mujoco_menagerie/franka_emika_panda/panda.xml", partial(arm, hand="hand")),
+    "ur5e_servos": (
+        "mujoco_menagerie/universal_robots_ur5e/ur5e.xml",
+        partial(arm, hand="wrist_3_link"),
+    ),
+    "xarm7_servos": (
+        "mujoco_menagerie/ufactory_xarm7/xarm7_nohand.xml",
+        partial(arm, hand="link7"),
+    ),
+    "go1_servos": (
+        "mujoco_menagerie/unitree_go1/go1.xml",
+        partial(legs, GO1, "??", forward=0.3),
+    ),
     "go1_stand": (f"{_LEGS}/unitree_go1/xmls/go1.xml", _go1),
     "go1_forward": (f"{_LEGS}/unitree_go1/xmls/go1.xml", partial(_go1, forward=0.3)),
     "spot_stand": (f"{_ARMS}/spot/robot.xml", _spot),

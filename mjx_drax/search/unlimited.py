@@ -1,0 +1,183 @@
+"""First without the ends of actuators' forces, then with them.
+
+Beyond those ends f has no slope, and no noise brings the controls of all knots back. So a problem
+whose controls can be there is solved in steps, by one program that gets other numbers:
+
+    at first    actuators give any force, and constraints keep forces within their ranges where
+                knots begin: f is smooth, and what is found is a motion of the true system too
+    from there  with the true ranges, a polish and rollouts; constraints keep controls from where
+                they are of no use, which no motion needs
+    anew        the same from random knots, with all attempts, if that first motion does not exist,
+                or if it gains much where forces may be at their ends
+
+Answers are those of the problem as given, without these constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mjx_drax.method.langevin import State
+from mjx_drax.method.model import Multipliers
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
+from mjx_drax.search.chains import Chains, best_of
+from mjx_drax.search.engine import Found, Search
+from mjx_drax.search.restarts import Restarts, Rollouts
+from mjx_drax.search.units import CONSTRAINTS, to_units
+from mjx_drax.search.warm import Warm
+
+MUCH = 0.1
+"""Share of the cost that shows that forces at their ends matter."""
+
+Searched = Callable[[Problem, Restarts, Warm | None], tuple[Search, Found]]
+"""Runs a search for a problem, with settings, from the guess given to `solve` or from these chains.
+"""
+
+
+class Both(NamedTuple):
+    """The problems of the steps, and how many constraints of a stage each has besides."""
+
+    first: Problem
+    then: Problem
+    rows: int
+
+
+def both_of(problem: Problem) -> Both | None:
+    """What is solved in place of the problem; None if no force is in its way."""
+    unlimited = problem.dynamics.unlimited()
+    if unlimited is None or not problem.holds_beyond(unlimited.useful):
+        return None
+    first, then = (
+        replace(problem, constraint=problem.constraint.with_inequality(ends, unlimited.rows))
+        for ends in (unlimited.at_once, unlimited.all_along)
+    )
+    return Both(replace(first, dynamics=unlimited.dynamics), then, unlimited.rows)
+
+
+def found_in_steps(
+    problem: Problem, both: Both, settings: Restarts, searched: Searched
+) -> tuple[Problem, Found]:
+    """What the steps come to: the problem, in units of its constraints, and what was found."""
+    smooth = replace(settings, rollouts=Rollouts(first=0, rounds=0))
+    search, found = searched(both.first, smooth, None)
+    every, least, chains = [found], _least(found), None
+    gains_much = True
+    if np.isfinite(least):
+        assert settings.polish is not None
+        short = replace(settings, attempts=1, polish=replace(settings.polish, patience=1))
+        warm = _wider(both, _in_users_units(search.family.problem, found.chains))
+        search, found = searched(both.then, short, warm)
+        chains = _after(every, found)
+        floor = float(search.stage.floor[0])
+        gains_much = _least(found) - floor < (1.0 - MUCH) * (least - floor)
+    if chains is None or (gains_much and not found.interrupted):
+        before = search.family.problem
+        search, found = searched(both.then, settings, None)
+        anew = _after(every, found)
+        if chains is None:
+            chains = anew
+        else:
+            chains = _in_units_of(search.family.problem, before, chains)
+            chains = best_of(chains, anew, np.arange(len(anew.missed)))
+    given, state = _as_given(problem, search.family.problem, chains.state)
+    return given, _joined(every, replace(chains, state=state))
+
+
+def _least(found: Found) -> float:
+    """The lowest cost of a chain that is feasible, and does not miss the goal."""
+    return float(found.chains.sound_cost.min())
+
+
+def _after(every: list[Found], found: Found) -> Chains:
+    """The chains of a search, feasible since so many iterations of all; it is put to the others."""
+    before, since = sum(each.records[-1][0] for each in every), found.chains.feasible_since
+    every.append(found)
+    return replace(found.chains, feasible_since=np.where(since < 0, since, before + since))
+
+
+def _joined(every: list[Found], chains: Chains) -> Found:
+    """All searches, one after the other, with these chains."""
+    records, began, before = [], [], 0
+    for found in every:
+        records += [(before + n, info) for n, info in found.records]
+        began += [(before + a, before + b) for a, b in found.began]
+        before = records[-1][0]
+    last = every[-1]
+    return replace(last, chains=chains, records=records, began=began, flow=every[0].flow)
+
+
+def _in_users_units(problem: Problem, chains: Chains) -> Warm:
+    """Chains of a problem that measures constraints in units, in those of a user."""
+    state = chains.state
+    knots, multipliers = to_units(problem, state.trajectory, state.multipliers, back=True)
+    return Warm(knots, multipliers, state.gains)
+
+
+def _in_units_of(problem: Problem, before: Problem, chains: Chains) -> Chains:
+    """Chains in the units of this problem, not in those of the one before."""
+    users = _in_users_units(before, chains)
+    knots, multipliers = to_units(problem, users.knots, users.multipliers)
+    state = replace(chains.state, trajectory=knots, multipliers=multipliers)
+    return replace(chains, state=state)
+
+
+def _wider(both: Both, warm: Warm) -> Warm:
+    """Chains of the first step for the next one, whose constraints leave more room.
+
+    Slacks grow by that, and forces on them are what balances the barrier there.
+    """
+    knots, multipliers = warm.knots, warm.multipliers
+    own, rows = knots.slack, slice(-both.rows, None)
+    assert own is not None  # for the type checker, as below
+    assert multipliers.bounds is not None
+    lower, upper = multipliers.bounds
+    wide = jax.vmap(both.then.inequalities)(knots)
+    assert lower.slack is not None
+    assert wide is not None
+    slack = jnp.maximum(-wide.stage, own.stage)[..., rows]
+    force = (lower.slack.stage * own.stage)[..., rows] / slack
+
+    def with_rows(numbers: Stagewise, new: Array) -> Stagewise:
+        return replace(numbers, stage=numbers.stage.at[..., rows].set(new))
+
+    of_bounds = replace(lower, slack=with_rows(lower.slack, force)), upper
+    of_rows = with_rows(multipliers.constraints, force)
+    return Warm(
+        replace(knots, slack=with_rows(own, slack)),
+        replace(multipliers, constraints=of_rows, bounds=of_bounds),
+        warm.gains,
+    )
+
+
+def _as_given(problem: Problem, solved: Problem, state: State) -> tuple[Problem, State]:
+    """The problem in units of its own constraints, and the states (rows, ...) of its chains."""
+    given = {}
+    for name in CONSTRAINTS:
+        own, unit = getattr(problem, name), getattr(solved, name).unit
+        given[name] = replace(own, unit=None if unit is None else unit[: own.rows])
+    stage, end = problem.constraint, problem.terminal_constraint
+
+    def own_slack(slack: Any) -> Stagewise | None:
+        if stage.inequalities + end.inequalities == 0:
+            return None
+        return replace(slack, stage=slack.stage[..., : stage.inequalities])
+
+    def without(z: Trajectory) -> Trajectory:
+        return replace(z, slack=own_slack(z.slack))
+
+    forces, bounds = state.multipliers.constraints, state.multipliers.bounds
+    multipliers = Multipliers(
+        state.multipliers.dynamics,
+        replace(forces, stage=forces.stage[..., : stage.rows]),
+        None if bounds is None else (without(bounds[0]), without(bounds[1])),
+    )
+    states = replace(state, trajectory=without(state.trajectory), multipliers=multipliers)
+    return replace(problem, **given), states
