@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
+from mjx_drax.polish.interior_point import Progress
 from mjx_drax.search.iterate import FEASIBLE, ranking
 
 CHEAPER = 1e-3
@@ -51,6 +52,14 @@ class Chains:
     def feasible(self) -> np.ndarray:
         """Whether max|h| < `FEASIBLE`, (rows,)."""
         return np.asarray(self.info.max_defect) < FEASIBLE
+
+    @property
+    def optimal(self) -> np.ndarray:
+        """Whether a polish has brought it to its tolerance, (rows,)."""
+        polish = self.state.polish
+        if not isinstance(polish, Progress):
+            return np.zeros(len(self.missed), bool)
+        return np.asarray(polish.optimal)
 
     @property
     def sound(self) -> np.ndarray:
@@ -180,10 +189,13 @@ def finished(kept: Chains, now: Chains, floor: float) -> Chains:
     return Chains(state, info, since, np.where(worse, kept.missed, polished.missed))
 
 
-def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
+def best_of(
+    kept: Chains, found: Chains, owners: np.ndarray, floor: np.ndarray | None = None
+) -> Chains:
     """For every chain the best of what it has and what was found for it, as `Chains.order` ranks.
 
-    owners (rows of found,) says for which chain each row of `found` is.
+    owners (rows of found,) says for which chain each row of `found` is. With a floor of the costs
+    (chains,), what is optimal stays unless something is cheaper by more than `CHEAPER`.
     """
     chains = len(kept.missed)
 
@@ -192,6 +204,9 @@ def best_of(kept: Chains, found: Chains, owners: np.ndarray) -> Chains:
 
     infeasible, value = ranking(both(lambda a: a.cost), both(lambda a: a.info.max_defect))
     of, missed = np.concatenate([np.arange(chains), owners]), both(lambda a: a.missed)
+    if floor is not None:
+        proven = both(lambda a: a.optimal) & ~infeasible.astype(bool)
+        value = value - np.where(proven, CHEAPER * np.abs(value - floor[of]), 0.0)
     source = first_of(of, infeasible, value, missed)
     pairs = (kept.state, kept.info), (found.state, found.info)
     if all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(pairs)):

@@ -162,7 +162,8 @@ class Replayer:
         late = np.ones(len(self.floor), bool)
         # One replay that arrives, with feedback or without, is enough
         late[rows] = missed & chains.missed[rows] if with_feedback else missed
-        return best_of(_only(replace(chains, missed=late), rows), found, np.arange(len(late)))
+        kept = _only(replace(chains, missed=late), rows)
+        return best_of(kept, found, np.arange(len(late)), self.floor)
 
     def _rolled_out(
         self, chains: Chains, with_feedback: float, rows: np.ndarray | slice = slice(None)

@@ -75,7 +75,7 @@ def shot(
             told,
         )
         found = replayer.taken(now, rows, shots, stage.done)
-        before, now = now, best_of(now, found, np.arange(len(now.missed)))
+        before, now = now, best_of(now, found, np.arange(len(now.missed)), replayer.floor)
         damping = np.where(_same(before, now), damping, 1.0)
     count = stage.rollouts + 1 if np.isfinite(damping).any() else rollouts.total
     return replace(stage, now=now, damping=damping, rollouts=count), ended
@@ -95,7 +95,7 @@ def after_round(
     missed = np.ones(len(now.missed), bool)  # until it is shown
     found = Chains(*iterated(np.minimum(damping, most)), np.full(len(missed), done), missed)
     found, better = replayer.rolled_out_in_part(now, found, rows, done)
-    before, now = now, best_of(now, found, np.arange(len(now.missed)))
+    before, now = now, best_of(now, found, np.arange(len(now.missed)), replayer.floor)
     factor = np.where(better == 1.0, LESS_DAMPING, np.where(better > 0.0, 1.0, MORE_DAMPING))
     settled = _same(before, now) & (better == 0.0) & (damping >= most)
     damping = np.where(settled, np.inf, np.clip(damping * factor, *DAMPING_RANGE))

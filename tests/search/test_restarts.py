@@ -1,6 +1,6 @@
 """Descending first, heating what failed: nothing found is lost, and no setting depends on units."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import jax
@@ -33,6 +33,7 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import State
 from mjx_drax.method.schedules import Scale
+from mjx_drax.polish.interior_point import Progress
 from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.search import restarts
 from mjx_drax.search.chains import Chains, best_of
@@ -307,6 +308,22 @@ def test_every_chain_keeps_the_best_that_was_found_for_it(kind):
     np.testing.assert_array_equal(best.state.trajectory[:, 0], expected)
     np.testing.assert_array_equal(best.feasible_since, expected)
     np.testing.assert_array_equal(best.info.cost, [4.0, 7.0, 3.0, 8.0])
+
+
+def test_a_rollout_replaces_what_is_optimal_only_if_it_costs_clearly_less():
+    def polished(chains, optimal):
+        names = [f.name for f in fields(Progress)]
+        polish = Progress(**(dict.fromkeys(names, jnp.zeros(3)) | {"optimal": jnp.array(optimal)}))
+        return replace(chains, state=replace(chains.state, polish=polish))
+
+    kept = attempt([1001.0, 1001.0, 5.0], [0.0, 0.0, 1.0], 100)
+    found = attempt([1000.9995, 1000.99, 5.0], [0.0, 0.0, 0.5], 200)
+    assert not kept.optimal.any()
+    kept, found = polished(kept, [True] * 3), polished(found, [False] * 3)
+    best = best_of(kept, found, np.arange(3), np.full(3, 1e3))
+    np.testing.assert_array_equal(best.feasible_since, [100, 201, 202])
+    best = best_of(kept, found, np.arange(3))
+    np.testing.assert_array_equal(best.feasible_since, [200, 201, 202])
 
 
 def test_what_a_replay_missed_is_better_than_infeasible_only():
