@@ -6,14 +6,16 @@ import math
 from collections.abc import Sequence
 from html import escape
 
+import jax
 import numpy as np
 
+from mjx_drax.base.errors import DraxError
 from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
-from mjx_drax.solution.violations import GOAL, TRACKING, entry_name, words
+from mjx_drax.solution.violations import GOAL, TRACKING, Violation, entry_name, words
 from mjx_drax.solution.worst import of_engine
 
 OPTIMA = 5
@@ -29,6 +31,9 @@ INTERRUPTED = "interrupted    the solve was ended before its time; this is the b
 
 ALIKE = 0.01
 """Costs that differ by less than this share are the same."""
+
+ALIKE_BROKEN = 0.1
+"""Chains whose largest violations differ by no more than this share end alike."""
 
 ON_BOUND = 0.01
 """Share of its range within which an entry is on an end of it."""
@@ -241,6 +246,38 @@ def _most_bounded(solution: Results) -> tuple[str, float]:
     return said, times / K
 
 
+def _broken_besides(solution: Results, where: Violation) -> str:
+    """Which other constraints the best plan breaks by a tenth as much or more, at most two."""
+    problem, chain = solution.problem, solution.best_chain
+    found: list[Violation] = []
+    if problem.constraint.rows + problem.terminal_constraint.rows < 2:
+        return ""
+    try:
+        with problem.arithmetic():
+            knots = jax.tree.map(lambda a: a[chain], solution.trajectories)
+            values = jax.jit(problem.constraints)(knots)
+    except DraxError:  # its functions are not there
+        return ""
+    for stem, part, rows in (
+        ("", problem.constraint, np.asarray(values.stage)),
+        ("terminal_", problem.terminal_constraint, np.asarray(values.terminal)[None]),
+    ):
+        equal = np.arange(part.rows) < part.equalities
+        sizes = np.where(equal, np.abs(rows), np.maximum(rows, 0.0))
+        units = np.ones(part.rows) if part.unit is None else np.asarray(part.unit)
+        for row in range(part.rows):
+            kind = f"{stem}{'equality' if equal[row] else 'inequality'}"
+            knot = int(sizes[:, row].argmax())
+            size = float(sizes[knot, row])
+            entry = row if equal[row] else row - part.equalities
+            at = problem.horizon if stem else knot
+            broken = Violation(kind, size * units[row], FEASIBLE * units[row], entry, at)
+            if (kind, entry) != (where.kind, where.entry) and broken.ratio >= 0.1 * where.ratio:
+                found.append(broken)
+    most = sorted(found, key=lambda v: -v.ratio)[:2]
+    return "".join(f"; it also {v.told(problem)}" for v in most)
+
+
 def _advice(solution: Results) -> str:
     """What to try when no chain could be certified; the shell has the same names."""
     if solution.interrupted:
@@ -270,7 +307,16 @@ def _advice(solution: Results) -> str:
         more.append("longer durations" if free else "a longer horizon")
         if share >= 0.5:  # it does all it may, and time or room is what is missing
             more = ["wider bounds", *more[::-1]]
-        return f"{told}{bounded}. Try {', '.join(more[:-1])}, or {more[-1]}."
+        told += bounded + _broken_besides(solution, where)
+        worst = solution.max_defect
+        alike = int(np.isclose(worst, worst[solution.best_chain], rtol=ALIKE_BROKEN).sum())
+        if "equality" in where.kind and len(worst) > 2 and alike > len(worst) / 2:
+            ways = [way for way in more if "iterations" not in way and solution.problem.dynamics.nx]
+            return (
+                f"{told}. So do {alike} of {len(worst)} chains, as if what is asked had no "
+                f"solution: loosen it, or give {' or '.join([*ways, 'a guess'])}."
+            )
+        return f"{told}. Try {', '.join(more[:-1])}, or {more[-1]}."
     unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])
     if unplanned is not None:
         knot, contact = unplanned

@@ -138,13 +138,12 @@ def solve(
         def solved(problem: Problem) -> Answer[Solution]:
             first = spent == [0.0, 0.0]
             recorder = record if first or record is None else Recorder(record.every)
-            report, step = reporting(progress, problem.name), count()
-            ended: list[bool] = []  # what follows an interrupted search does not go on
+            step, ended = count(), [False]  # what follows an interrupted search does not go on
 
             def searched(
                 posed: Problem, settings: Restarts, warm: Warm | None
             ) -> tuple[Search, Found]:
-                n = next(step)
+                n, report = next(step), reporting(progress, problem.name)
                 search = Search(
                     Family.of_one(posed),
                     chains,
@@ -154,12 +153,12 @@ def solve(
                     guess=given if warm is None else warm,
                     checkpoint=saved(n) if first else None,
                     recorder=None if n else recorder,
-                    seconds=0.0 if ended else most - spent[1],
+                    seconds=0.0 if ended[0] else most - spent[1],
                 )
                 with report as search.progress, said_plainly(f"the solve of {problem.name}"):
                     found = search.run()
                 spent[:] = spent[0] + found.compile_time, spent[1] + found.solve_time
-                ended.extend([True] * found.interrupted)
+                ended[0] |= found.interrupted
                 return search, found
 
             # No chain may end worse than a guess; and without a polish, the flow is as it was asked

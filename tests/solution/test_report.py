@@ -8,8 +8,10 @@ import pytest
 from builders import BALL, arm, made_up, point, robot
 
 from mjx_drax import DraxError, Restarts, Solution, from_program, minimize, solve_batch
+from mjx_drax.search.family import Family
 from mjx_drax.solution import report
 from mjx_drax.solution.names import difference_names
+from mjx_drax.solution.replay import plan_violations
 from mjx_drax.solution.report import lines
 from mjx_drax.solution.violations import DYNAMICS, GOAL, KINDS, Violation
 
@@ -53,6 +55,28 @@ def test_an_infeasible_plan_says_which_bound_it_lies_on():
     u[:, :, 1] = value
     advice = str(replace(far, trajectories=replace(made.trajectories, u=u))).splitlines()[-1]
     assert "10 of 10 knots. Try wider bounds, a longer horizon, or more iterations." in advice
+
+
+def test_constraints_that_cannot_hold_together_are_named():
+    def apart(x, u):
+        return jnp.array([0.1 + x[0], 0.2 - x[0], x[1] - 5.0])
+
+    problem = point(inequality=apart, terminal_equality=lambda x: x[1:] - 1.0)
+    made = made_up(problem, chains=4)
+    off = plan_violations(Family.of_one(problem), made.plans.astype(float), made.trajectories.u)
+    worst = np.array([0.2, 0.205, 0.195, 1.0], np.float32)
+    bad = replace(made, max_defect=worst, plan=off)
+    advice = str(bad).splitlines()[-1]
+    assert "the best breaks terminal equality [0] by 1.0e+00" in advice
+    assert (
+        "; it also breaks inequality [1] by 2.0e-01 (tolerated: 1.0e-03) at knot 0, 0 s" in advice
+    )
+    assert "; it also breaks inequality [0] by 1.0e-01" in advice
+    assert "inequality [2]" not in advice
+    assert "So do 3 of 4 chains, as if what is asked had no solution: loosen it, or" in advice
+    assert "iterations" not in advice
+    few = str(replace(bad, max_defect=worst * [1, 2, 3, 4])).splitlines()[-1]
+    assert few.endswith("at knot 0, 0 s. Try more iterations, or a longer horizon.")
 
 
 def test_a_cost_without_a_lower_bound_is_told():
