@@ -12,8 +12,11 @@ what was read stays until the next solve looks again (`search.identity`).
 
 from __future__ import annotations
 
+import sysconfig
+import traceback
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -103,8 +106,25 @@ def _jaxpr(
             given = " and ".join(map(_kind, arguments))
             missing = _missing(function) if "NoneType" in str(error) else ""
             way = missing or f"Change it: it is called with {count}, {given}"
-        raise DraxError(f"{label} failed when it was traced: {plain(error)}. {way}.") from error
+        said = f"{plain(error)}{_place(error)}"
+        raise DraxError(f"{label} failed when it was traced: {said}. {way}.") from error
 
+
+def _place(error: Exception) -> str:
+    """The last line of a user's own code that an error went through; nothing if there is none."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if path.is_file() and not any(path.is_relative_to(folder) for folder in _OF_OTHERS):
+            return f" ({path.name}, line {frame.lineno})"
+    return ""
+
+
+_OF_OTHERS = (
+    *(Path(str(module.__file__)).parent for module in (jax, np)),
+    Path(__file__).parents[1],
+    *(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib")),
+)
+"""Folders of code that is not a user's."""
 
 _OF_TRACED = (
     jax.errors.ConcretizationTypeError,
@@ -140,7 +160,10 @@ def _knot_of(function: Any) -> Any:
 def _kind(argument: Any) -> str:
     argument = getattr(argument, "seen", argument)  # of a knot that is given beside it
     shape = getattr(argument, "shape", None)
-    return f"a {type(argument).__name__}" if shape is None else f"an array of shape {shape}"
+    name = type(argument).__name__
+    return (
+        f"a{'n' * (name[0] in 'AEIOU')} {name}" if shape is None else f"an array of shape {shape}"
+    )
 
 
 def _out_of_range(closed: ClosedJaxpr) -> Iterator[tuple[str, tuple[int, ...]]]:

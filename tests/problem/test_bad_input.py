@@ -19,6 +19,7 @@ from builders import INF, NAN, At, arm, assert_complains, cases, point
 
 from mjx_drax import (
     LBFGS,
+    DraxError,
     GaussNewton,
     Identity,
     Langevin,
@@ -384,3 +385,17 @@ def test_a_reverse_rule_is_enough_for_a_flow_that_needs_no_other():
 @pytest.mark.parametrize("bounds", [None, (-INF, INF), (-INF, 1.0), np.array([[-1, -1], [1, 1]])])
 def test_bounds_that_leave_room_are_accepted(bounds):
     assert np.isfinite(point(x_bounds=bounds).scatter.x_upper).all()
+
+
+def test_an_error_in_a_users_function_is_told_with_its_line():
+    def helper(x):
+        return jnp.ones(3) @ x
+
+    def cost(x, u):
+        return helper(x)
+
+    line = helper.__code__.co_firstlineno + 1
+    with pytest.raises(DraxError, match=rf"\(test_bad_input\.py, line {line}\)\. Change it: "):
+        point(running_cost=cost)
+    with pytest.raises(DraxError, match=r"traced: NameError: .* is not defined \("):
+        point(running_cost=lambda x, u: nothing_of_that_name)  # noqa: F821
