@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar, cast
@@ -13,19 +14,47 @@ from jax.interpreters.partial_eval import dce_jaxpr
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+REMEMBERED = 100
+"""So many traces of a function are remembered."""
+
+
+class _Traces:
+    """What a function computes of arguments of each shape, and the structure of its result."""
+
+    def __init__(self) -> None:
+        self.known: dict[Any, tuple[ClosedJaxpr, Any]] = {}
+
+
+_every = weakref.WeakSet[_Traces]()
+
+
+def forget() -> None:
+    """Let pruned functions be traced anew: what they read besides their arguments may have changed.
+
+    And let go of the traces now: while one lives, JAX takes an array's numbers of its time.
+    """
+    for traces in _every:
+        traces.known.clear()
+
+
 def pruned(function: Function) -> Function:
     """The same function of pytrees of arrays, without the operations that its result does not need.
 
     XLA drops these, but only after JAX has differentiated and lowered them; and a step of physics
-    computes much that a cost does not read. Arguments of the same shapes are traced once.
+    computes much that a cost does not read. Arguments of the same shapes are traced once; see
+    `forget`.
     """
-    known: dict[Any, tuple[ClosedJaxpr, Any]] = {}
+    traces = _Traces()
+    _every.add(traces)
 
     @wraps(function)
     def lean(*arguments: Any) -> Any:
         inputs, structure = jax.tree.flatten(arguments)
         asked = structure, *map(jax.typeof, inputs)
+        known = traces.known
         if asked not in known:
+            if len(known) == REMEMBERED:
+                known.clear()
             program, _, tree = needed_program(function, arguments)
             known[asked] = program, tree
         program, tree = known[asked]

@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, primitives
 from mjx_drax.base.digests import digest
 from mjx_drax.base.structures import Unspelled, spelled
 from mjx_drax.kernels.linalg import full_precision
-from mjx_drax.kernels.pruning import pruned
+from mjx_drax.kernels.pruning import forget, pruned
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.rollout import untraced
 from mjx_drax.search.captured import changed_in_place, not_read
@@ -78,6 +78,7 @@ def look_again(problem: Problem) -> None:
 
 
 def _forget() -> None:
+    forget()
     jax.clear_caches()
     untraced.cache_clear()
 

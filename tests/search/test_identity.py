@@ -210,9 +210,13 @@ def test_another_program_has_what_functions_read_by_then():
         assert np.allclose(minimize(program, chains=2, progress=False).x, target[0], atol=1e-3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("many", [False, True])
-@pytest.mark.parametrize("target", [[0.5], np.array([0.5])], ids=["list", "array"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=SLOW)])
+@pytest.mark.parametrize(
+    "target", [pytest.param([0.5], marks=SLOW), np.array([0.5])], ids=["list", "array"]
+)
 def test_another_motion_has_what_functions_read_by_then(many, target):
     def running(x, u):
         return 1e-3 * u @ u + (x[0] - jnp.asarray(target)[0]) ** 2
