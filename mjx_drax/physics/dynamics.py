@@ -42,7 +42,7 @@ from mjx_drax.physics.mjx_model import (
     put_model,
 )
 from mjx_drax.physics.observed import Observed
-from mjx_drax.physics.saturation import Ends, ends_of, unlimited, useful_controls
+from mjx_drax.physics.saturation import Ends, finite_ends, unlimited, useful_controls
 from mjx_drax.physics.source import Source, binary, model_name
 from mjx_drax.problem.differentiators import Autodiff, Differentiator, InScalars
 from mjx_drax.problem.dynamics import Dynamics, Unlimited
@@ -299,10 +299,7 @@ class MjxDynamics(Dynamics):
 
     def unlimited(self) -> Unlimited[MjxDynamics] | None:
         """The same with `saturation.unlimited` actuators; the C engine keeps the model as it is."""
-        at_once = ends_of(self.model)
-        at_once = None if at_once is None else at_once.finite()
-        all_along = ends_of(self.model, float(self.dt))
-        all_along = None if all_along is None else all_along.finite()
+        at_once, all_along = (finite_ends(self.model, time) for time in (0.0, float(self.dt)))
         if at_once is None or all_along is None:
             return None
         return Unlimited(

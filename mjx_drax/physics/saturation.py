@@ -53,14 +53,6 @@ class Ends:
         change = self.by_q * qpos[..., list(self.q)] + self.by_v * qvel[..., list(self.v)]
         return self.low + change, self.high + change
 
-    def finite(self) -> Ends | None:
-        """Those that are finite at both ends, on the host; None if none are."""
-        (some,) = np.nonzero(np.isfinite(self.low) & np.isfinite(self.high))
-        if not some.size:
-            return None
-        own, q, v = (tuple(np.array(n)[some].tolist()) for n in (self.actuators, self.q, self.v))
-        return Ends(own, q, v, self.low[some], self.high[some], self.by_q[some], self.by_v[some])
-
     def passed(self, data: Any, u: Array) -> Array:
         """By how much controls are beyond the ends, (2 n,): positive if they are."""
         low, high = self.at(data.qpos, data.qvel)
@@ -119,6 +111,18 @@ def ends_of(model: mjx.Model, time: float = 0.0) -> Ends | None:
         by_q=by_q,
         by_v=by_v + time * by_q,
     )
+
+
+def finite_ends(model: mjx.Model, time: float = 0.0) -> Ends | None:
+    """`ends_of` those that are finite at both ends, on the host; None if none are."""
+    ends = ends_of(model, time)
+    if ends is None:
+        return None
+    (some,) = np.nonzero(np.isfinite(ends.low) & np.isfinite(ends.high))
+    if not some.size:
+        return None
+    own, q, v = (tuple(np.array(n)[some].tolist()) for n in (ends.actuators, ends.q, ends.v))
+    return Ends(own, q, v, ends.low[some], ends.high[some], ends.by_q[some], ends.by_v[some])
 
 
 def useful_controls(model: mjx.Model, x: Array) -> tuple[Array, Array] | None:

@@ -37,8 +37,8 @@ class Unlimited(Generic[System]):
         useful: the ends (..., nu) of controls of use at states (..., nx); see `useful_controls`.
         at_once: by how much controls of a stage are beyond the ends, from what functions of a stage
             are called with, (rows,): no force then leaves its range as the knot begins.
-        all_along: the same of controls at whose ends forces are largest until the next knot: no
-            motion needs controls beyond.
+        all_along: the same of controls at whose ends forces are largest until the next knot, by an
+            estimate: a motion should need none beyond.
         rows: of both.
     """
 

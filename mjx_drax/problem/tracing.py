@@ -160,10 +160,10 @@ def _knot_of(function: Any) -> Any:
 def _kind(argument: Any) -> str:
     argument = getattr(argument, "seen", argument)  # of a knot that is given beside it
     shape = getattr(argument, "shape", None)
+    if shape is not None:
+        return f"an array of shape {shape}"
     name = type(argument).__name__
-    return (
-        f"a{'n' * (name[0] in 'AEIOU')} {name}" if shape is None else f"an array of shape {shape}"
-    )
+    return f"an {name}" if name[0] in "AEIOU" else f"a {name}"
 
 
 def _out_of_range(closed: ClosedJaxpr) -> Iterator[tuple[str, tuple[int, ...]]]:

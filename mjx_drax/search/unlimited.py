@@ -4,11 +4,13 @@ Beyond those ends f has no slope, and no noise brings the controls of all knots 
 whose controls can be there is solved in steps, by one program that gets other numbers:
 
     at first    actuators give any force, and constraints keep forces within their ranges where
-                knots begin: f is smooth, and what is found is a motion of the true system too
+                knots begin: f is smooth, and the true system can mostly do what is found
     from there  with the true ranges, a polish and rollouts; constraints keep controls from where
-                they are of no use, which no motion needs
-    anew        the same from random knots, with all attempts, if that first motion does not exist,
-                or if it gains much where forces may be at their ends
+                they are of no use, by a generous estimate
+    anew        the same from random knots, with all attempts, if no chain of the first step is
+                sound, or if the second gained much: forces at their ends then matter
+    as given    from there without these constraints, by a program of its own, only if one bears a
+                force in a chain that seems to be optimal, as where the cost rewards such controls
 
 Answers are those of the problem as given, without these constraints.
 """
@@ -26,6 +28,7 @@ from jax import Array
 
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Multipliers
+from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.search.chains import Chains, best_of
@@ -66,13 +69,13 @@ def found_in_steps(
     problem: Problem, both: Both, settings: Restarts, searched: Searched
 ) -> tuple[Problem, Found]:
     """What the steps come to: the problem, in units of its constraints, and what was found."""
+    assert settings.polish is not None  # for the type checker
     smooth = replace(settings, rollouts=Rollouts(first=0, rounds=0))
+    short = replace(settings, attempts=1, polish=replace(settings.polish, patience=1))
     search, found = searched(both.first, smooth, None)
     every, least, chains = [found], _least(found), None
     gains_much = True
     if np.isfinite(least):
-        assert settings.polish is not None
-        short = replace(settings, attempts=1, polish=replace(settings.polish, patience=1))
         warm = _wider(both, _in_users_units(search.family.problem, found.chains))
         search, found = searched(both.then, short, warm)
         chains = _after(every, found)
@@ -86,9 +89,31 @@ def found_in_steps(
             chains = anew
         else:
             chains = _in_units_of(search.family.problem, before, chains)
-            chains = best_of(chains, anew, np.arange(len(anew.missed)))
-    given, state = _as_given(problem, search.family.problem, chains.state)
+            floors = np.full(len(anew.missed), search.stage.floor[0])
+            chains = best_of(chains, anew, np.arange(len(floors)), floors)
+    solved = search.family.problem
+    given, state = _as_given(problem, solved, chains.state)
+    if not found.interrupted and _bear(both, solved, chains, settings.polish).any():
+        warm = _in_users_units(given, replace(chains, state=state))
+        search, found = searched(problem, short, warm)
+        return search.family.problem, _joined(every, _after(every, found))
     return given, _joined(every, replace(chains, state=state))
+
+
+def _bear(both: Both, solved: Problem, chains: Chains, polish: Polish) -> np.ndarray:
+    """Which chains that seem optimal lean on a constraint of a step, (chains,).
+
+    Its multiplier times the room between both ends is then more than the tolerance of the cost.
+    """
+    users, n = _in_users_units(solved, chains), both.rows // 2
+    assert users.knots.slack is not None  # for the type checker
+    force, slack = (
+        np.asarray(numbers.stage)[..., -both.rows :]
+        for numbers in (users.multipliers.constraints, users.knots.slack)
+    )
+    room = np.tile(slack[..., :n] + slack[..., n:], 2)
+    worth = (force * room).max(axis=(1, 2)) / np.asarray(chains.state.polish.cost)
+    return chains.optimal & (worth > np.asarray(polish.tolerance))
 
 
 def _least(found: Found) -> float:

@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from html import escape
 
 import jax
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
+from mjx_drax.kernels.compilation import compiled
 from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.problem.problem import Problem
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
+from mjx_drax.search.identity import identity
 from mjx_drax.search.iterate import FEASIBLE
+from mjx_drax.search.units import with_units
 from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
-from mjx_drax.solution.violations import GOAL, TRACKING, Violation, entry_name, words
+from mjx_drax.solution.violations import (
+    GOAL,
+    TRACKING,
+    Violation,
+    entry_name,
+    with_plan_tolerance,
+    words,
+)
 from mjx_drax.solution.worst import of_engine
 
 OPTIMA = 5
@@ -249,33 +262,36 @@ def _most_bounded(solution: Results) -> tuple[str, float]:
 def _broken_besides(solution: Results, where: Violation) -> str:
     """Which other constraints the best plan breaks by a tenth as much or more, at most two."""
     problem, chain = solution.problem, solution.best_chain
-    found: list[Violation] = []
     if problem.constraint.rows + problem.terminal_constraint.rows < 2:
         return ""
     try:
         with problem.arithmetic():
             knots = jax.tree.map(lambda a: a[chain], solution.trajectories)
-            values = jax.jit(problem.constraints)(knots)
+            values = _constraints(with_units(problem, None), knots)
     except DraxError:  # its functions are not there
         return ""
+    found = []
     for stem, part, rows in (
         ("", problem.constraint, np.asarray(values.stage)),
         ("terminal_", problem.terminal_constraint, np.asarray(values.terminal)[None]),
     ):
-        equal = np.arange(part.rows) < part.equalities
-        sizes = np.where(equal, np.abs(rows), np.maximum(rows, 0.0))
-        units = np.ones(part.rows) if part.unit is None else np.asarray(part.unit)
-        for row in range(part.rows):
-            kind = f"{stem}{'equality' if equal[row] else 'inequality'}"
-            knot = int(sizes[:, row].argmax())
-            size = float(sizes[knot, row])
-            entry = row if equal[row] else row - part.equalities
+        for row, column in enumerate(rows.T):
+            equal = row < part.equalities
+            sizes = np.abs(column) if equal else np.maximum(column, 0.0)
+            kind = f"{stem}{'equality' if equal else 'inequality'}"
+            entry, knot = row - (not equal) * part.equalities, int(sizes.argmax())
             at = problem.horizon if stem else knot
-            broken = Violation(kind, size * units[row], FEASIBLE * units[row], entry, at)
+            broken = Violation(kind, float(sizes[knot]), math.nan, entry, at)
+            broken = with_plan_tolerance(problem, broken)
             if (kind, entry) != (where.kind, where.entry) and broken.ratio >= 0.1 * where.ratio:
                 found.append(broken)
     most = sorted(found, key=lambda v: -v.ratio)[:2]
     return "".join(f"; it also {v.told(problem)}" for v in most)
+
+
+@partial(compiled, key=lambda problem, knots: identity((problem, knots), problem))
+def _constraints(problem: Problem, knots: Trajectory) -> Stagewise:
+    return problem.constraints(knots)
 
 
 def _advice(solution: Results) -> str:
@@ -311,10 +327,12 @@ def _advice(solution: Results) -> str:
         worst = solution.max_defect
         alike = int(np.isclose(worst, worst[solution.best_chain], rtol=ALIKE_BROKEN).sum())
         if "equality" in where.kind and len(worst) > 2 and alike > len(worst) / 2:
-            ways = [way for way in more if "iterations" not in way and solution.problem.dynamics.nx]
+            if solution.problem.dynamics.nx == 0:  # a program has no horizon
+                more = []
+            ways = [*(way for way in more if "iterations" not in way), "a guess"]
             return (
                 f"{told}. So do {alike} of {len(worst)} chains, as if what is asked had no "
-                f"solution: loosen it, or give {' or '.join([*ways, 'a guess'])}."
+                f"solution: loosen it, or give {' or '.join(ways)}."
             )
         return f"{told}. Try {', '.join(more[:-1])}, or {more[-1]}."
     unplanned = solution.problem.dynamics.left_out(solution.plans[solution.best_chain])

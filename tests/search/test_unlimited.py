@@ -148,6 +148,21 @@ def test_what_needs_more_than_the_ends_at_once_is_searched_for_anew(searches):
 
 
 @pytest.mark.slow
+def test_nothing_is_optimal_that_leans_on_a_constraint_of_a_step(searches):
+    """The cost rewards controls beyond the ends; two chains seemed optimal at 23.2."""
+
+    def running(data, u):
+        return jnp.concatenate([0.3 * data.qvel, 0.3 * (u - 3.9)])
+
+    problem = posed(actuator=NARROW, running_residual=running)
+    solution = solve(problem, chains=4, seed=0, solver=Restarts(attempts=1))
+    assert [posed.constraint.inequalities for posed in searches] == [2, 2, 0]
+    assert solution.certified
+    assert solution.replay_cost[solution.best_chain] < 18.0
+    assert np.all(solution.replay_cost[solution.optimal_chains] < 18.0)
+
+
+@pytest.mark.slow
 def test_no_chain_is_worse_than_a_guess(monkeypatch):
     problem = posed(actuator=NARROW)
     best = solve(problem, chains=2, solver=Restarts(attempts=1)).best
