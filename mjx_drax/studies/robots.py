@@ -105,10 +105,12 @@ def arm(path: Path, hand: str = "right_hand", start: Sequence[float] | None = No
     home = np.array(model.key_qpos[0] if start is None else start)
     turned = home + np.eye(len(home))[0] * np.deg2rad(70)
     (_, middle, end), on = _poses(model, hand, np.linspace(home, turned, 3)), Terms(model)
-    links, half = tuple(range(2, model.nbody)), 0.5 * np.ptp(model.actuator_ctrlrange, axis=1)
-    running = on.control(weight=1e-2 / half**2) + on.velocity(weight=1e-3)
     if (model.actuator_biastype != 0).any():
         running = on.velocity(weight=1e-2)
+    else:
+        half = 0.5 * np.ptp(model.actuator_ctrlrange, axis=1)
+        running = on.control(weight=1e-2 / half**2) + on.velocity(weight=1e-3)
+    links = tuple(range(2, model.nbody))
 
     def there(data: mujoco.MjData) -> bool:
         off = np.linalg.norm(data.body(hand).xpos - end[0])
