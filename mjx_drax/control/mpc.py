@@ -33,6 +33,7 @@ terminal cost also runs along the horizon, with the weight `hold`.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -106,6 +107,12 @@ class Statistics:
     failed: int = 0
     switches: int = 0
     unmeasured: int = 0
+
+    def __repr__(self) -> str:
+        took = [1e3 * seconds for seconds in self.latencies] or [math.nan]
+        half, most = np.quantile(took, [0.5, 0.99])
+        times = f"median {half:.2g} ms, 99 % within {most:.2g} ms"
+        return f"<Statistics of {self.plans} plans: {times}>"
 
     @property
     def plans(self) -> int:

@@ -71,6 +71,9 @@ class Plan:
     dt: Any
     time: float = 0.0
 
+    def __repr__(self) -> str:
+        return f"<Plan of {len(self.u)} controls from {self.time:.6g} s: cost {self.cost}>"
+
 
 @register_dataclass
 @dataclass(frozen=True)

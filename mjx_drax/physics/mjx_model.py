@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import fnmatch
+import re
 from collections.abc import Sequence
 
 import jax
@@ -235,7 +236,8 @@ def _refusal(model: mujoco.MjModel, without: set[Pair], reason: str) -> str:
         (("mjtEnableBit", "mjENBL"), "clear this flag"),
     ):
         if any(name in reason for name in names):
-            return f"MJX does not support {reason}: {fix}."
+            meant = ", ".join(re.findall(r"mj[A-Z]+_\w+", reason)) or reason
+            return f"MJX does not support {meant}: {fix}."
     return f"MJX does not support this model: {reason}"
 
 

@@ -156,6 +156,8 @@ def _actuator(model: mujoco.MjModel, a: int) -> Report:
         kind = "muscle"
     elif model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
         kind = "servo"
+    elif model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_AFFINE:
+        kind = "damper"
     if model.actuator_actnum[a]:
         kind += " with state"
     transmission = mujoco.mjtTrn(model.actuator_trntype[a]).name[6:].lower()

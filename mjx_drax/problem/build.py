@@ -163,6 +163,11 @@ def from_function(
     require_functions(**given, goal=goal, guess=guess)
     if f is None:
         raise DraxError("f is None: give the dynamics, a function f(x, u) -> x_next.")
+    if nu == 0:
+        raise DraxError(
+            "nu is 0: give a whole number of at least 1. What is left to choose without controls, "
+            "as parameters, needs one that f does not read; a cost on it keeps it at 0."
+        )
     require_whole("nu", nu)
     if nu > MOST:
         raise DraxError(f"nu is {nu}, the size of a control: give at most {MOST:,}.")

@@ -241,7 +241,8 @@ def parameter_ends(
         if not good or not isinstance(name, str):
             raise DraxError(
                 f"the parameter {shown(name)} is {shown(pair)}: give (lower, upper), finite "
-                "numbers or arrays of one shape with lower < upper."
+                "numbers or arrays of one shape with lower < upper; what is fixed is a number in "
+                "your functions."
             )
         shapes.append((name, lower.shape))
         low.append(lower.ravel())

@@ -524,7 +524,7 @@ class Problem:
         except Exception as error:
             raise DraxError(
                 f"goal failed at x = {shown(x.tolist())}: {reason(error)}. Make it a function of "
-                "the state of a function problem, or of the mujoco.MjData of a model."
+                "the state of a function problem, or of the mujoco.MjData of a model, alone."
             ) from error
         if reached.size != 1 or reached.dtype.kind != "b":
             raise DraxError(
@@ -640,7 +640,10 @@ def checked(problem: Problem) -> Problem:
         require_length("data" + jax.tree_util.keystr(path), rows, problem.horizon + 1)
     costs = (problem.running, problem.terminal)
     if all(part is None for cost in costs for part in (cost.scalar, cost.residual)):
-        raise DraxError(f"{name} has no cost: give a running or a terminal one.")
+        raise DraxError(
+            f"{name} has no cost: give a running or a terminal one; where any "
+            "motion will do, running_cost=lambda x, u: 1e-6 * (u @ u)."
+        )
     with problem.arithmetic():
         for label, function, arguments, shape in functions_of(problem):
             if label != STEP or not dynamics.checked:  # tracing MJX takes a second

@@ -90,6 +90,10 @@ class Optimum:
     trajectory: Trajectory
     replayed: tuple[np.ndarray, np.ndarray]
 
+    def __repr__(self) -> str:
+        known = f"residual {self.residual:.1e}, {'' if self.optimal else 'not '}optimal"
+        return f"<Optimum: cost {self.cost:.6g}, {self.share:.0%} of chains, {known}>"
+
 
 @dataclass(frozen=True)
 class Results:

@@ -44,7 +44,9 @@ def of_engine(solution: Results, chain: int) -> list[Violation]:
     """Violations of the dynamics by a chain's plan, as the engine that replays it has them."""
     problem, plan, u, _ = _motion(solution, chain)
     off = problem.engine_defects(plan, u)
-    allowed = np.broadcast_to(FEASIBLE * np.asarray(problem.defect_unit(plan)), off.shape)
+    with problem.arithmetic():
+        unit = np.asarray(problem.defect_unit(plan))
+    allowed = np.broadcast_to(FEASIBLE * unit, off.shape)
     return list(worst_knots(DYNAMICS, off, allowed, 0))
 
 

@@ -98,6 +98,8 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
     assert policy.statistics.plans == 59
     assert policy.statistics.failed == 0
     assert np.median(policy.statistics.max_defects) < 1e-4
+    assert repr(policy.statistics).startswith("<Statistics of 59 plans: median ")
+    assert repr(policy.latest).startswith("<Plan of ")
 
 
 @pytest.mark.slow

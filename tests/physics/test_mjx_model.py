@@ -163,7 +163,7 @@ APART = {"links": 'contype="0" conaffinity="0"'}
         ),
         (
             {"actuator": '<adhesion body="upper" ctrlrange="0 1"/>'},
-            "does not support.*drive joints, tendons or sites",
+            "does not support mjTRN_BODY: drive joints, tendons or sites",
         ),
         ({"actuator": f"<general {MUSCLE}/>"}, "does not support.*use motors"),
         ({"flag": 'override="enable"'}, "does not support.*clear this flag"),

@@ -78,6 +78,13 @@ def rail():
     return problem, solve(problem, chains=2, solver=ONCE, precision=64)
 
 
+def test_what_is_printed_later_is_computed_in_float64(rail):
+    _, found = rail
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # as where JAX makes float32 of float64
+        assert "CERTIFIED" in str(found)
+
+
 def assert_double(*trees):
     for leaf in jax.tree.leaves(trees):
         assert leaf.dtype == np.float64

@@ -28,6 +28,8 @@ def test_print_is_the_report_and_repr_one_line():
         "<Solution of arm: 2 chains, CERTIFIED, not known to be optimal, cost 0 when replayed>"
     )
     assert f"{[solution]}" == f"[{solution!r}]"
+    (optimum,) = solution.optima
+    assert repr(optimum) == "<Optimum: cost 0, 100% of chains, residual nan, not optimal>"
 
 
 def test_a_notebook_shows_the_report_as_a_table_and_no_markup_of_others():
