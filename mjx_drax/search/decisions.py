@@ -159,7 +159,28 @@ class Decisions:
                 heated = better if found.any() else not stage.heated
             elif stage.attempt > 0 and not self.thorough:
                 heated &= better
-        return np.flatnonzero(missing > (1.0 - self.done_share) * many), heated
+        asked = missing > (1.0 - self.done_share) * many
+        if not asked.any() and self.alone and self.settings.heated:
+            heated = self._better_may_be_left(stage)
+            asked |= heated
+        return np.flatnonzero(asked), heated
+
+    def _better_may_be_left(self, stage: Stage) -> bool:
+        """Whether an attempt with noise at a single problem may bring a better optimum.
+
+        After the first attempt, if its places have converged to optima of different costs: there
+        are several basins. Later, if the latest attempt came to the best one, and only once.
+        """
+        kept, now, scale, floor = stage.kept, stage.now, stage.cost_scale[0], stage.floor[0]
+        assert kept is not None
+        best = kept.sound_cost - floor
+        bar = done_up_to(best, np.asarray(kept.info.size), CHEAPER, scale)
+        if stage.attempt > 0:
+            return bool((stage.ends[int(stage.heated)] - floor <= bar).sum() == 1)
+        if self.polish is None:
+            return False
+        optimal, alive = on_host((now.state.polish.optimal, now.state.alive), self.mesh)
+        return bool((optimal & alive & now.sound & (now.cost - floor > bar)).any())
 
     def sound_costs(self, stage: Stage, chains: Chains, indices: np.ndarray) -> np.ndarray:
         """Costs of those problems' chains, from their floors, (len(indices), chains)."""

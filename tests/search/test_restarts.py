@@ -79,6 +79,36 @@ def swing(weight=1.0):
     )
 
 
+def two_links(obstacle):
+    """A planar arm, at rest before and after, whose hand keeps 0.4 m away from a point."""
+
+    def rate(x, u):
+        v, c, s = x[2:], jnp.cos(x[1]), jnp.sin(x[1])
+        M = jnp.array([[1.667 + c, 0.333 + 0.5 * c], [0.333 + 0.5 * c, 0.333]])
+        bias = 0.5 * s * jnp.array([-(2 * v[0] + v[1]) * v[1], v[0] ** 2])
+        return jnp.concatenate([x[2:], jnp.linalg.solve(M, u - bias)])
+
+    def step(x, u):
+        half = x + 0.025 * rate(x, u)
+        return x + 0.05 * rate(half, u)
+
+    def too_near(x, u):
+        first, both = x[0], x[0] + x[1]
+        hand = jnp.array([jnp.cos(first) + jnp.cos(both), jnp.sin(first) + jnp.sin(both)])
+        return 0.16 - jnp.sum((hand - jnp.array(obstacle)) ** 2)
+
+    return from_function(
+        step,
+        x_init=[0.0, 0.3, 0.0, 0.0],
+        nu=2,
+        dt=0.05,
+        horizon=2.0,
+        running_residual=lambda x, u: 0.3 * u,
+        terminal_equality=lambda x: x - jnp.array([1.3, 0.3, 0.0, 0.0]),
+        inequality=too_near,
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("start", "coolings"), [(6.0, 0), (1e3, 2), (1e4, 3)])
 def test_an_attempt_that_noise_throws_away_starts_again_with_less(start, coolings):
@@ -215,6 +245,31 @@ def test_a_solve_ends_after_the_seconds_that_it_is_given():
     found = solve(point(), chains=2, max_seconds=1e-9)
     assert found.interrupted
     assert found.iterations <= 20
+
+
+@pytest.mark.parametrize(("wind", "heated"), [(0.0, []), (0.01, [True])])
+def test_optima_of_different_costs_make_one_more_attempt_with_noise(wind, heated):
+    either = from_function(
+        lambda x, u: x + DT * u,
+        x_init=[0.0],
+        nu=1,
+        dt=DT,
+        horizon=1.0,
+        running_residual=lambda x, u: 0.3 * (u + wind),
+        terminal_residual=lambda x: 10.0 * (x**2 - 1.0),
+    )
+    found = search(Restarts(SHORT), 16, either)
+    assert len(np.unique(np.sign(found.chains.state.trajectory.x[:, -1, 0]))) == 2  # both are found
+    assert [end > began for began, end in found.began if end > began] == heated
+
+
+@pytest.mark.slow
+def test_an_optimum_that_noise_has_found_once_makes_another_attempt():
+    arm = two_links(obstacle=[1.2, 0.9])
+    once = solve(arm, chains=16, solver=Restarts(attempts=1))
+    assert 13.0 < once.cost.min() < once.cost.max() < 14.0  # so all chains are done
+    found = solve(arm, chains=16)
+    assert found.cost.min() == pytest.approx(7.565, rel=1e-2)
 
 
 @pytest.mark.slow
