@@ -297,6 +297,10 @@ TASKS: dict[str, tuple[str, Callable[[Path], Problem]]] = {
         "mujoco_menagerie/ufactory_xarm7/xarm7_nohand.xml",
         partial(arm, hand="link7"),
     ),
+    "kinova_servos": (
+        "mujoco_menagerie/stanford_tidybot/tidybot.xml",
+        partial(arm, hand="bracelet_link"),
+    ),
     "go1_servos": (
         "mujoco_menagerie/unitree_go1/go1.xml",
         partial(legs, GO1, "??", forward=0.3),

@@ -159,7 +159,8 @@ def test_where_most_places_disagree_one_more_attempt_looks_for_better_optima():
     )
     assert (once.chains.cost < 2 * once.chains.cost.min()).all()  # all chains are done
     assert [end > began for began, end in twice.began][:2] == [False, True]
-    agreed = search(Restarts(SHORT, tries=4), 16)
+    good = from_program(2, cost=wells, bounds=([-2.0, -2.0], [-0.5, 2.0]))
+    agreed = search(Restarts(SHORT, tries=4), 16, good)
     assert not any(end > began for began, end in agreed.began)
 
 
