@@ -361,6 +361,15 @@ class MjxDynamics(Dynamics):
                 lambda k, x, u: stepper(u), self.host_difference, plan, u, gains, limits
             )
 
+    def between_knots(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """States (K, substeps - 1, nx) of the C engine after all but the last step of each knot.
+
+        From states (K, nx) under controls (K, nu).
+        """
+        more = self.substeps - 1
+        with Stepper(self.mj_model, 1, x, knots=more) as stepper:
+            return stepper.run(np.repeat(u[:, None], more, axis=1))[0]
+
     def stepper(self, x: np.ndarray) -> Stepper:
         """The C engine with states (chains, nx) that advance together."""
         return Stepper(self.mj_model, self.substeps, x, self._spare)

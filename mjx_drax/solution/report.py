@@ -18,6 +18,7 @@ from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.search.identity import identity
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.units import with_units
+from mjx_drax.solution.between import broken_between_knots
 from mjx_drax.solution.names import control_names, difference_names, state_names
 from mjx_drax.solution.replay import OPEN_LOOP, WITH_FEEDBACK
 from mjx_drax.solution.results import STALLED, UNFINISHED, Optimum, Results
@@ -70,6 +71,7 @@ def lines(solution: Results) -> list[str]:
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     hints = (_fall(solution), _off_the_engine(solution)) if solution.certified else ()
+    between = _between_knots(solution) if solution.certified else ""
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -78,6 +80,7 @@ def lines(solution: Results) -> list[str]:
         f"{solution.max_defect[best]:.1e}",
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
+        *([f"               {between}"] if between else []),
         f"optimality     {solution.optimality}",
         *(f"               {hint}" for hint in hints if hint),
         *optima_lines(solution),
@@ -193,6 +196,19 @@ def _only(solution: Results) -> str:
 def _fall(solution: Results) -> str:
     converged = solution.residual[solution.best_chain] < solution.tolerance
     return endless(solution.history["cost"][0], solution.cost, converged)
+
+
+def _between_knots(solution: Results) -> str:
+    """What there is to say where a replay breaks an inequality between two knots."""
+    broken = broken_between_knots(solution, solution.best_chain)
+    if broken is None:
+        return ""
+    knot = broken.knot
+    return (
+        f"between knots {knot} and {knot + 1}, after {solution.times[knot]:.3g} s, inequality "
+        f"[{broken.entry}] is broken by {broken.size:.1e} (tolerated: {broken.allowed:.1e}): plans "
+        "keep constraints at knots alone. Give a smaller dt, or keep more distance"
+    )
 
 
 def _off_the_engine(solution: Results) -> str:

@@ -43,13 +43,14 @@ from mjx_drax.search.iterate import FEASIBLE, identity_of_rows, joined
 from mjx_drax.solution.names import control_names, difference_names, state_names
 
 GOAL, TRACKING, DYNAMICS = "goal", "tracking", "dynamics"
+INEQUALITY = "inequality"
 
 MEASURED = (
     TRACKING,
     "state_bounds",
     "control_bounds",
     "equality",
-    "inequality",
+    INEQUALITY,
     "terminal_equality",
     "terminal_inequality",
 )
@@ -384,7 +385,7 @@ def measured(
         off: x_K - plan, (n, ndx).
         extent: of the plans, from `extents`.
     """
-    cost, found, _ = _evaluated(family, motion, off, extent, tolerances)
+    cost, found, *_ = _evaluated(family, motion, off, extent, tolerances)
     size, allowed, entry, knot = found
 
     def framed(values: np.ndarray, filling: float) -> np.ndarray:
@@ -396,6 +397,21 @@ def measured(
     return cost, Violations(
         framed(size, 0.0), framed(allowed, np.nan), framed(entry, -1), framed(knot, -1)
     )
+
+
+def inequalities(
+    family: Family,
+    motion: tuple[np.ndarray, np.ndarray],
+    extent: tuple[np.ndarray, ...],
+    tolerances: Tolerances,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes of violations of inequalities at all stages, and what is tolerated, (n, K, entries).
+
+    Args are those of `measured`.
+    """
+    off = np.zeros((len(motion[0]), family.problem.dynamics.ndx))
+    size, allowed = _evaluated(family, motion, off, extent, tolerances)[3]
+    return size.astype(float), allowed.astype(float)
 
 
 def _evaluated(
@@ -429,10 +445,11 @@ def _measured(
     off: Array,
     extent: tuple[Array, ...],
     limits: Limits,
-) -> tuple[Array, tuple[Array, ...], list[tuple[Array, Array]]]:
+) -> tuple[Array, tuple[Array, ...], list[tuple[Array, Array]], tuple[Array, Array]]:
     """Cost (n,); size, tolerance, entry and knot of the largest violation, (kinds, n) each.
 
-    Also sizes and tolerances of all entries, (n, entries), of the last two kinds, at the end.
+    Also sizes and tolerances of all entries, (n, entries), of the last two kinds, at the end, and
+    of inequalities at all stages, (n, K, entries).
     """
 
     def of_motion(own: Problem, motion: tuple[Array, Array], off: Array, extent: Any) -> Any:
@@ -445,9 +462,10 @@ def _measured(
         worst = [_largest(*kind) for kind in kinds]
         ends = [(size[0], allowed[0]) for size, allowed, _ in kinds[-2:]]
         cost = problem.cost(Trajectory(states[1:], u, start=start))
-        return cost, tuple(map(jnp.stack, zip(*worst, strict=True))), ends
+        stages = kinds[MEASURED.index(INEQUALITY)][:2]
+        return cost, tuple(map(jnp.stack, zip(*worst, strict=True))), ends, stages
 
-    found: Any = jax.vmap(of_motion, out_axes=(0, 1, 0))(own, motion, off, extent)
+    found: Any = jax.vmap(of_motion, out_axes=(0, 1, 0, 0))(own, motion, off, extent)
     return found
 
 

@@ -1,0 +1,63 @@
+"""Do inequalities hold between knots, too? Replays of models are asked at each physics step.
+
+Plans and certificates keep constraints at knots. A step of the C engine is a fraction of the time
+between two, so a replay shows what happens there. The knot before and the one after are both asked
+about a state between them, with their own times, data and controls: what only one of them forbids,
+as a constraint of chosen times does, is not counted. After the last stage there is no such knot.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.search.family import Family
+from mjx_drax.solution.results import Results
+from mjx_drax.solution.violations import INEQUALITY, Violation, extents, inequalities
+
+
+def broken_between_knots(solution: Results, chain: int) -> Violation | None:
+    """The inequality that a chain's better replay breaks most between knots; None if none.
+
+    Its knot is the one before. Where a problem has further states, such as rates or parameters, and
+    for functions, nothing is known of the time between knots.
+    """
+    problem = solution.problem
+    dynamics = mjx_dynamics(problem.dynamics)
+    if dynamics is None or dynamics is not problem.dynamics or dynamics.substeps == 1:
+        return None
+    if not problem.constraint.inequalities:
+        return None
+    ran = solution.replays_in(solution.mode_of(chain))
+    states, u = ran.states[chain], ran.controls[chain]
+    between = dynamics.between_knots(states[:-1], u).swapaxes(0, 1)
+    before = np.repeat(states[None], len(between), axis=0)
+    after = before.copy()
+    before[:, :-1], after[:, 1:-1] = between, between[:, :-1]
+    size, allowed = _at_stages(solution, chain, np.concatenate([before, after]), u)
+    (size, behind), (allowed, most) = np.split(size, 2), np.split(allowed, 2)
+    size = np.minimum(size[:, :-1], behind[:, 1:])
+    allowed = np.maximum(allowed[:, :-1], most[:, 1:])
+    if not (size > allowed).any():
+        return None
+    at = np.unravel_index(np.argmax(np.where(size > allowed, size - allowed, 0.0)), size.shape)
+    return Violation(INEQUALITY, float(size[at]), float(allowed[at]), int(at[2]), int(at[1]))
+
+
+def _at_stages(
+    solution: Results, chain: int, states: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`inequalities` of states (n, K + 1, nx) under the same controls (K, nu).
+
+    As many at a time as there are chains: what judges replays is compiled for these.
+    """
+    chains, plan = solution.chains, solution.plans[[chain]].astype(float)
+    extent = extents(solution.problem, plan, np.asarray(solution.trajectories.u[[chain]]))
+    own = tuple(np.repeat(each, chains, axis=0) for each in extent)
+    family, controls = Family.of_one(solution.problem), np.repeat(u[None], chains, axis=0)
+    found = []
+    for i in range(0, len(states), chains):
+        rows = np.resize(states[i : i + chains], (chains, *states.shape[1:]))
+        found.append(inequalities(family, (rows, controls), own, solution.tolerances))
+    size, allowed = (np.concatenate(each)[: len(states)] for each in zip(*found, strict=True))
+    return size, allowed
