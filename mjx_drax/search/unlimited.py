@@ -7,8 +7,8 @@ whose controls can be there is solved in steps, by one program that gets other n
                 knots begin: f is smooth, and the true system can mostly do what is found
     from there  with the true ranges, a polish and rollouts; constraints keep controls from where
                 they are of no use, by a generous estimate
-    anew        the same from random knots, with all attempts, if no chain of the first step is
-                sound, or if the second gained much: forces at their ends then matter
+    anew        the same from random knots or the guess, with all attempts, if no chain of the first
+                step is sound, or if the second gained much: forces at their ends then matter
     as given    from there without these constraints, by a program of its own, only if one bears a
                 force in a chain that seems to be optimal, as where the cost rewards such controls
 
@@ -33,6 +33,8 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.search.chains import Chains, best_of
 from mjx_drax.search.engine import Found, Search
+from mjx_drax.search.initial import initial_knots
+from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, Rollouts
 from mjx_drax.search.units import CONSTRAINTS, to_units
 from mjx_drax.search.warm import Warm
@@ -63,6 +65,17 @@ def both_of(problem: Problem) -> Both | None:
         for ends in (unlimited.at_once, unlimited.all_along)
     )
     return Both(replace(first, dynamics=unlimited.dynamics), then, unlimited.rows)
+
+
+def is_motion(problem: Problem, guess: Trajectory | Warm | None, chains: int) -> bool:
+    """Whether a guess is a solution, or obeys the dynamics for any chain: none may end worse."""
+    if guess is None or isinstance(guess, Warm):
+        return guess is not None
+    knots = initial_knots(problem, chains, guess, jax.random.key(0))
+    plans = np.asarray(problem.with_start(knots))
+    off = problem.engine_defects(plans, np.asarray(knots.u))
+    allowed = [FEASIBLE * np.asarray(problem.defect_unit(plan)) for plan in plans]
+    return bool((off <= np.array(allowed)[:, None]).all(axis=(1, 2)).any())
 
 
 def found_in_steps(

@@ -26,7 +26,7 @@ from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
 from mjx_drax.search.restarts import Restarts, settled
 from mjx_drax.search.units import to_units
-from mjx_drax.search.unlimited import both_of, found_in_steps
+from mjx_drax.search.unlimited import both_of, found_in_steps, is_motion
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.progress import reporting
@@ -161,11 +161,10 @@ def solve(
                 ended[0] |= found.interrupted
                 return search, found
 
-            # No chain may end worse than a guess; and without a polish, the flow is as it was asked
+            # No chain may end worse than its guess; and without a polish, the flow is as was asked
             polish = settings.polish
-            in_steps = given is None and polish is not None and polish.iterations
-            both = both_of(problem) if in_steps else None
-            if both is None:
+            both = both_of(problem) if polish is not None and polish.iterations else None
+            if both is None or is_motion(problem, given, chains):
                 search, found = searched(problem, settings, None)
                 problem = search.family.problem
             else:

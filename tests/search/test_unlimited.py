@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_drax import Restarts, from_mjcf, solve
+from mjx_drax import Restarts, Trajectory, from_mjcf, solve
 from mjx_drax.search import unlimited
-from mjx_drax.search.unlimited import both_of
+from mjx_drax.search.unlimited import both_of, is_motion
 
 ARM = """
 <mujoco model="arm"><option timestep="0.01" {option}/><compiler angle="radian"/><worldbody>
@@ -162,10 +162,36 @@ def test_nothing_is_optimal_that_leans_on_a_constraint_of_a_step(searches):
     assert np.all(solution.replay_cost[solution.optimal_chains] < 18.0)
 
 
+def line(problem):
+    """Knots on a straight line to the end, which no control makes."""
+    share = np.linspace(0.0, 1.0, problem.horizon + 1)[1:, None]
+    return Trajectory(share * [1.0, 1.0], share)
+
+
+def test_a_guess_is_a_motion_if_one_chain_obeys_the_dynamics():
+    problem = posed(actuator=NARROW)
+    no_motion, rest = line(problem), np.zeros((problem.horizon, 2))
+    u = np.zeros((problem.horizon, 1))
+    assert not is_motion(problem, None, 2)
+    assert not is_motion(problem, no_motion, 2)
+    assert is_motion(problem, Trajectory(rest, u), 2)  # it hangs where it is
+    either = jax.tree.map(lambda a, b: np.stack([a, b]), no_motion, Trajectory(rest, u))
+    assert is_motion(problem, either, 2)
+
+
+@pytest.mark.slow
+def test_a_guess_that_is_no_motion_is_improved_without_ends_first(searches):
+    problem = posed("-6 6", actuator=NARROW)
+    found = solve(problem, chains=2, solver=Restarts(attempts=1), guess=line(problem))
+    assert len(searches) == 2
+    assert found.certified
+    assert found.optimal_chains.all()
+
+
 @pytest.mark.slow
 def test_no_chain_is_worse_than_a_guess(monkeypatch):
     problem = posed(actuator=NARROW)
     best = solve(problem, chains=2, solver=Restarts(attempts=1)).best
-    monkeypatch.setattr("mjx_drax.solution.solve.both_of", lambda problem: 1 / 0)
+    monkeypatch.setattr("mjx_drax.solution.solve.found_in_steps", lambda *_: 1 / 0)
     again = solve(problem, chains=2, solver=Restarts(attempts=1), guess=best)
     assert float(again.cost.max()) <= float(problem.cost(best)) * 1.001
