@@ -11,7 +11,7 @@ from builders import DT, K, double_integrator, robot
 from mjx_drax import MPC, DraxError, Restarts, from_function
 from mjx_drax.control.open_quantities import Applied, at_present, driven
 from mjx_drax.control.shift import shifted
-from mjx_drax.search.iterate import start
+from mjx_drax.search.iterate import FEASIBLE, start
 
 FAST = Restarts(replace(Restarts().flow, iterations=30, tail=30), descent=40, attempts=1)
 GOAL = np.array([1.0, 0.0])
@@ -140,7 +140,7 @@ def test_rates_stay_within_their_bounds_from_control_to_control(every):
     for k in range(60):
         u.append(policy(x, k * DT).item())
         x = x + DT * np.array([x[1], u[-1]]) + (np.array([0.1, -0.3]) if k == 20 else 0.0)
-    assert np.abs(np.diff(u) / DT).max() < 4.0 + 1e-4
+    assert np.abs(np.diff(u) / DT).max() < 4.0 * (1.0 + FEASIBLE)  # as plans may
     np.testing.assert_allclose(x, GOAL, atol=0.02)
     assert max(policy.statistics.max_defects) < 1e-4
     assert policy.planner._cache_size() == compiled
