@@ -123,8 +123,9 @@ class Restarts:
         attempts: largest number of attempts, the first included.
         within: a chain is done if it is feasible, reaches the goal where it was replayed, and
             exceeds the best chain's cost by at most this share. None: 0.1; 1 where f has kinks.
-        done_share: share of chains to be done; then no further attempt is made. None: 0.95, and 0.9
-            where f has kinks. Above 1 all attempts are made, by all chains, to their ends and (if
+        done_share: share of chains to be done; then no further attempt is made, but to look for
+            better optima where several are known (`Decisions`). None: 0.95, and 0.9 where f has
+            kinks. Above 1 all attempts are made, by all chains, to their ends and (if
             `heated`) with noise: that takes longer, and finds better optima where all chains of the
             first attempt lead to the same ones.
         heated: whether attempts after the first may be heated, or all descend like the first. None:

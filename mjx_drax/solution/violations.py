@@ -411,7 +411,7 @@ def inequalities(
     """
     off = np.zeros((len(motion[0]), family.problem.dynamics.ndx))
     size, allowed = _evaluated(family, motion, off, extent, tolerances)[3]
-    return size.astype(float), allowed.astype(float)
+    return np.asarray(size, float), np.asarray(allowed, float)
 
 
 def _evaluated(
@@ -422,10 +422,11 @@ def _evaluated(
     tolerances: Tolerances,
     least: float = STILL,
 ) -> Any:
-    """What `_measured` returns, on the host; `least` in place of `STILL`."""
+    """What `_measured` returns, on the host but for its last arrays; `least` instead of `STILL`."""
     with family.problem.arithmetic():
         given = _on_device(family.at(0), motion, off, extent, tolerances, least)
-        return jax.tree.map(np.asarray, _measured(*family.parts, *given))
+        *found, stages = _measured(*family.parts, *given)
+        return *jax.tree.map(np.asarray, found), stages
 
 
 def _on_device(problem: Problem, motion: Any, off: Any, extent: Any, *limits: Any) -> Any:
