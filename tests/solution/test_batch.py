@@ -148,20 +148,20 @@ def test_the_last_chains_of_a_large_batch_go_on_by_themselves(monkeypatch):
 
     def seen(self, state, start, stop):
         moved, info = iterated(self, state, start, stop)
-        looks.append((len(state.alive), stop, self._moving(moved).sum()))
+        looks.append((len(state.alive), stop, self.decisions.moving(moved).sum()))
         return moved, info
 
     def seen_going_on(self, state, info, rows, start, stop):
         moved, new = go_on(self, state, info, rows, start, stop)
         if stop > start:
             went_on.append(len(rows))
-            np.testing.assert_array_equal(rows, np.flatnonzero(self._moving(state)))
+            np.testing.assert_array_equal(rows, np.flatnonzero(self.decisions.moving(state)))
             others = np.delete(np.arange(32), rows)
             np.testing.assert_array_equal(new.cost[others], info.cost[others])
             knots, before = moved.trajectory.u, state.trajectory.u
             np.testing.assert_array_equal(knots[others], before[others])
             assert (np.abs(knots - before)[rows].max(axis=(1, 2)) > 0.0).all()
-            assert not self._moving(moved).any()
+            assert not self.decisions.moving(moved).any()
         return moved, new
 
     monkeypatch.setattr(engine, "MANY", 32)
