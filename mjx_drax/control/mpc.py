@@ -19,8 +19,8 @@ becomes feasible and clearly cheaper takes the place of the worst keeper, and is
 
 What a problem leaves open:
 
-    rates         are counted from the controls that the policy gave last; feedback between plans
-                  keeps the bounds of controls, not those of rates
+    rates         are counted from the controls that the policy gave last, and kept within their
+                  bounds, from those before each knot, by feedback too
     parameters    every plan chooses its own (`MPC.parameters`)
     duration      ends no later than at the first plan, so that less is left of it from plan to
                   plan, but no plan is shorter than its lower bound: in the end the policy holds
@@ -57,6 +57,7 @@ from mjx_drax.base.pytrees import packed, unpacked
 from mjx_drax.control.open_quantities import (
     Applied,
     is_constrained,
+    rate_ends,
     require_plannable,
 )
 from mjx_drax.control.planner import (
@@ -213,6 +214,7 @@ class MPC:
         self._lower, self._upper = (
             np.asarray(end, float) for end in (problem.bounds.u_lower, problem.bounds.u_upper)
         )
+        self._rate_ends = rate_ends(problem)
 
     @property
     def latest(self) -> Plan:
@@ -321,21 +323,23 @@ class MPC:
         step = float(plan.dt)
         s = np.clip((t - plan.time) / step, 0.0, K)
         k = int(min(s + 1e-6, K - 1))
-        u = np.asarray(plan.u[k], float)
+        u, applied = np.asarray(plan.u[k], float), self._applied
+        v = np.zeros(0)
+        if applied is not None and applied.any:  # rates are counted from what was applied
+            v = applied.before(plan.time + k * step, step)
         if np.isfinite(x).all():
             further = np.asarray(plan.x[k, len(x) :], float)
             planned = self._between(plan.x[k], plan.x[k + 1], s - k)[: len(x)]
-            own, applied = further, self._applied
-            if applied is not None and applied.any:  # rates are counted from what was applied
-                v = applied.before(plan.time + k * step, step)
-                own = np.append(further[: len(further) - len(v)], v)
+            own = np.append(further[: len(further) - len(v)], v)
             off = dynamics.host_difference(np.append(x, own), np.append(planned, further))
             u = u + plan.gains[k] @ off
         else:
             self.statistics.unmeasured += 1
+        if len(v):
+            u = np.clip(u, *(v[: len(u)] + step * end for end in self._rate_ends))
         u = np.clip(u, self._lower, self._upper)
-        if self._applied is not None:
-            self._applied.add(u, t, min(t, plan.time) - 2 * step)
+        if applied is not None:
+            applied.add(u, t, min(t, plan.time) - 2 * step)
         return u
 
     def __call__(self, x: ArrayLike, t: float) -> np.ndarray:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.problem.choices import Rates
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 
@@ -55,6 +57,16 @@ def is_constrained(problem: Problem) -> bool:
     dynamics = problem.dynamics
     free = isinstance(dynamics, Extended) and bool(dynamics.phases)
     return free or problem.constraint.rows + problem.terminal_constraint.rows > 0
+
+
+def rate_ends(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of rates of controls [unit of u / s], lower and upper, (nu,); infinite for none."""
+    low, high = (np.full(problem.dynamics.nu, end) for end in (-np.inf, np.inf))
+    every = jax.tree.leaves(problem.constraint, is_leaf=lambda node: isinstance(node, Rates))
+    for rates in (node for node in every if isinstance(node, Rates)):
+        low[list(rates.below)] = np.asarray(rates.lower)[list(rates.below)]
+        high[list(rates.above)] = np.asarray(rates.upper)[list(rates.above)]
+    return low, high
 
 
 def step_of(problem: Problem, states: Array) -> Array:
