@@ -345,7 +345,7 @@ def _summed(which: np.ndarray, rows: Array) -> Array:
     """Sums (m, k) of those rows (n, k) that each row of `which` (m, n) marks.
 
     CPUs call their library once for all states and directions of a batch: Jacobians of f then take
-    20 to 70 % of the time.
+    20 to 75 % of the time.
     """
 
     def by_library(rows: Array) -> Array:

@@ -19,7 +19,8 @@ from mjx_drax.polish.interior_point import Progress
 from mjx_drax.search.iterate import FEASIBLE, ranking
 
 CHEAPER = 1e-3
-"""A rollout is an improvement if it is cheaper by more than this share."""
+"""A rollout is an improvement if it is cheaper by more than this share. Optima whose costs differ
+by no more count as equal."""
 
 
 @register_dataclass
