@@ -281,5 +281,5 @@ def _with_rates(rates: Pair, inequality: Any, nu: int) -> Partial:
             f"upper, each ({nu},) or one number for all."
         )
     below, above = (tuple(map(int, np.flatnonzero(np.isfinite(e)))) for e in (lower, upper))
-    low, high = (jnp.asarray(np.nan_to_num(end), float) for end in (lower, upper))
+    low, high = (jnp.asarray(np.where(np.isfinite(e), e, 0.0), float) for e in (lower, upper))
     return as_partial(Rates(inequality, low, high, below, above))
