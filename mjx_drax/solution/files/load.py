@@ -265,17 +265,14 @@ class _Manifold(FunctionDynamics):
 def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
     """The problem as far as it was saved."""
     x_init = jnp.asarray(arrays["problem.x_init"])
-    stage, terminal = (
-        arrays[f"solution.multipliers.constraints.{part}"].shape[-1]
-        for part in ("stage", "terminal")
-    )
+    stage, terminal = (_constraint(part, arrays) for part in ("stage", "terminal"))
     cost = Cost(_missing("the cost"), None)
     return Problem(
         dynamics=_dynamics(summary, arrays),
         running=cost,
         terminal=cost,
-        constraint=_constraint(stage),
-        terminal_constraint=_constraint(terminal),
+        constraint=stage,
+        terminal_constraint=terminal,
         x_init=x_init,
         bounds=_box("problem.bounds", arrays),
         scatter=_box("problem.scatter", arrays),
@@ -287,8 +284,18 @@ def _stand_in(summary: dict[str, Any], arrays: Arrays) -> Problem:
     )
 
 
-def _constraint(rows: int) -> Constraint:
-    return Constraint(_missing("the constraint") if rows else None, None, rows, 0)
+def _constraint(part: str, arrays: Arrays) -> Constraint:
+    """With the rows that were saved; those of inequalities have slacks."""
+    slack = arrays.get(f"solution.trajectories.slack.{part}")
+    inequalities = 0 if slack is None else slack.shape[-1]
+    equalities = arrays[f"solution.multipliers.constraints.{part}"].shape[-1] - inequalities
+    missing = _missing("the constraint")
+    return Constraint(
+        missing if equalities else None,
+        missing if inequalities else None,
+        equalities,
+        inequalities,
+    )
 
 
 def _dynamics(summary: dict[str, Any], arrays: Arrays) -> Dynamics:
@@ -393,10 +400,10 @@ def _require_same(problem: Problem, summary: dict[str, Any], arrays: Arrays) -> 
 
 
 def _as_solved(problem: Problem, arrays: Arrays) -> Problem:
-    """The problem in the precision in which it was solved."""
-    x_init = arrays["problem.x_init"]
-    if problem.precision == 64 or x_init.dtype != np.float64:
-        return problem
-    double = problem.in_float64()
-    with double.arithmetic():
-        return replace(double, x_init=jnp.asarray(x_init))
+    """The problem in the precision, and with the box of initial knots, in which it was solved."""
+    saved = arrays["problem.x_init"]
+    double = problem.precision != 64 and saved.dtype == np.float64
+    problem = problem.in_float64() if double else problem
+    with problem.arithmetic():
+        x_init = jnp.asarray(saved) if double else problem.x_init
+        return replace(problem, x_init=x_init, scatter=_box("problem.scatter", arrays))

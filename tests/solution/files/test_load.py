@@ -76,11 +76,24 @@ def test_all_comes_back(name, request, tmp_path):
     assert len(again.optima) == len(solution.optima)
     np.testing.assert_array_equal(again.problem.times, solution.problem.times)
     np.testing.assert_array_equal(again.problem.x_init, solution.problem.x_init)
+    for part in ("constraint", "terminal_constraint"):
+        rows = [getattr(s.problem, part) for s in (again, solution)]
+        assert rows[0].inequalities == rows[1].inequalities
+        assert rows[0].equalities == rows[1].equalities
     plot_solution(again, tmp_path / "plot.png")
     assert again.save(tmp_path / "again").is_dir()
     np.testing.assert_array_equal(
         Solution.load(tmp_path / "again").feedback.states, solution.feedback.states
     )
+
+
+def test_the_box_that_fits_the_motion_comes_back_with_the_problem(point, tmp_path):
+    given, box = point.problem, point.problem.scatter
+    narrow = replace(box, x_lower=0.01 * box.x_lower, x_upper=0.01 * box.x_upper)
+    replace(point, problem=replace(given, scatter=narrow)).save(tmp_path)
+    again = Solution.load(tmp_path, given)
+    jax.tree.map(np.testing.assert_array_equal, again.problem.scatter, narrow)
+    again.certify()
 
 
 def test_a_model_comes_back_and_can_be_filmed(slider, folder, tmp_path):
