@@ -70,6 +70,8 @@ class Windowed:
 class AtTime(Windowed):
     """The same at the one knot that is nearest to `begin` = `end`."""
 
+    once = True  # a motion that ends before has skipped it
+
     def holds(self, time: Any, dt: Any) -> Array:
         """Whether the knot at a time is the nearest; halfway between two it is the first."""
         off = (time - self.begin) / dt + ROUNDING  # float32 cannot tell which is nearer

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -277,11 +277,14 @@ def assembled(
     times = float(dynamics.dt) * np.arange(horizon + 1)
     found = rows(data, times)
     first = jax.tree.map(lambda a: a[0], found)
-    steps_most = [np.full(count, most / count) for _, most, count in choices.phases]
-    latest = np.append(0.0, np.cumsum(np.concatenate(steps_most))) if steps_most else times
+    earliest, latest = (
+        _knots_of(choices.phases, end) if choices.phases else times for end in (0, 1)
+    )
     for label, function in given.items():
-        if function is not None:
-            _require_knots(as_partial(function), label, latest)
+        for node in _checking_knots(None if function is None else as_partial(function)):
+            node.check_knots(label, latest)
+            if getattr(node, "once", False):
+                _warn_if_skipped(node, label, earliest)
     if choices.phases:
         require_rows(data)
     free: tuple[tuple[int, ...], ...] = ()
@@ -315,16 +318,35 @@ def assembled(
     )
 
 
-def _require_knots(part: Any, label: str, times: np.ndarray) -> None:
-    """Let all that follows references or windows complain if x_0..x_K, at `times`, do not fit."""
-    nodes = jax.tree.leaves(part, is_leaf=lambda node: node is not part and _checks_knots(node))
-    for node in filter(_checks_knots, nodes):
-        node.check_knots(label, times)
-        _require_knots(node, label, times)
+def _knots_of(phases: Sequence[tuple[float, float, int]], end: int) -> np.ndarray:
+    """Times of x_0..x_K [s] if durations are the least (end 0), or the most (1)."""
+    steps = [np.full(phase[2], phase[end] / phase[2]) for phase in phases]
+    return np.append(0.0, np.cumsum(np.concatenate(steps)))
+
+
+def _checking_knots(part: Any) -> Iterator[Any]:
+    """All references and windows in a function, which complain if knots do not fit."""
+    for node in jax.tree.leaves(part, is_leaf=lambda n: n is not part and _checks_knots(n)):
+        if _checks_knots(node):
+            yield node
+            yield from _checking_knots(node)
 
 
 def _checks_knots(node: Any) -> bool:
     return hasattr(node, "check_knots")
+
+
+def _warn_if_skipped(node: Any, label: str, times: np.ndarray) -> None:
+    """Warn where a motion as short as it may be, with knots at `times`, ends before an event."""
+    try:
+        node.check_knots(label, times)
+    except DraxError as error:
+        warnings.warn(
+            f"in the shortest motion {error} There it asks nothing: give a longer least duration, "
+            "or see in solution.times whether the motion lasted so long.",
+            DraxWarning,
+            stacklevel=4,
+        )
 
 
 def _names(label: str, names: Sequence[str], count: int) -> tuple[str, ...]:

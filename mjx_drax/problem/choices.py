@@ -209,7 +209,8 @@ def _start(
         ) from error
     if np.isnan([lower, upper]).any() or (lower > upper).any():
         raise DraxError(f"x_init_bounds are {shown(choices.start)}: give lower <= upper.")
-    if (x < lower - 1e-6).any() or (x > upper + 1e-6).any():
+    rounded = 1e-6 * np.maximum(1.0, np.abs(x))  # x_init may be in float32
+    if (x < lower - rounded).any() or (x > upper + rounded).any():
         raise DraxError(
             f"x_init = {shown(x.tolist())} lies outside of x_init_bounds: move it inside."
         )
@@ -222,7 +223,7 @@ def _start(
             "x_init there."
         )
     places = [int(np.flatnonzero(entry == e)[0]) for e in free]
-    return places, (lower - x)[free], (upper - x)[free]
+    return places, np.minimum(lower - x, 0.0)[free], np.maximum(upper - x, 0.0)[free]
 
 
 def parameter_ends(

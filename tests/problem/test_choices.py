@@ -1,5 +1,6 @@
 """Free x_0, parameters, free durations and rates of controls, against closed forms."""
 
+import warnings
 from dataclasses import replace
 
 import jax
@@ -17,6 +18,7 @@ from mjx_drax import (
     Langevin,
     Solution,
     Trajectory,
+    at_time,
     between,
     export_keyframes,
     from_function,
@@ -99,6 +101,18 @@ def test_a_free_start_is_chosen_within_its_bounds():
     np.testing.assert_allclose(found.best.u[:, 0], solution[:-1], atol=2e-3)
     assert found.optimal
     assert found.certified
+
+
+def test_a_start_at_an_end_of_its_bounds_is_inside_after_rounding():
+    start = 100.1  # 1.5e-6 less in float32
+    problem = double_integrator(
+        x_init=[start, 0.0],
+        terminal_residual=lambda x: x - GOAL,
+        x_init_bounds=([start, -1.0], [start + 1.0, 1.0]),
+    )
+    box = problem.bounds
+    np.testing.assert_array_equal(box.start_lower, [0.0, -1.0])
+    np.testing.assert_allclose(box.start_upper, [1.0, 1.0], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -538,6 +552,16 @@ def test_windows_may_lie_within_the_longest_durations():
     assert fastest(inequality=slow).horizon == 20
     with pytest.raises(DraxError, match="inequality holds from 6 to 7 s"):
         fastest(inequality=between(lambda x, u: u - 1.0, 6.0, 7.0))
+
+
+def test_a_motion_that_may_end_before_a_time_that_is_asked_for_is_told():
+    gate = at_time(lambda x, u: x[:1] - 0.2, 3.0)
+    with pytest.warns(DraxWarning, match="in the shortest motion equality holds at 3 s, where it"):
+        fastest(equality=gate)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fastest(equality=gate, horizon=(3.5, 5.0))
+        fastest(inequality=between(lambda x, u: u - 1.0, 4.0, 4.5))  # for a while, if at all
 
 
 def test_a_free_duration_and_rates_are_counted_from_where_x_0_is():
