@@ -51,8 +51,8 @@ class Chains:
 
     @property
     def feasible(self) -> np.ndarray:
-        """Whether max|h| < `FEASIBLE`, (rows,)."""
-        return np.asarray(self.info.max_defect) < FEASIBLE
+        """Whether max|h| < `FEASIBLE`, and the cost is finite, (rows,)."""
+        return (np.asarray(self.info.max_defect) < FEASIBLE) & np.isfinite(self.cost)
 
     @property
     def optimal(self) -> np.ndarray:

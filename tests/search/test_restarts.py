@@ -366,6 +366,15 @@ def test_every_chain_keeps_the_best_that_was_found_for_it(kind):
     np.testing.assert_array_equal(best.info.cost, [4.0, 7.0, 3.0, 8.0])
 
 
+def test_a_motion_whose_cost_is_not_a_number_is_not_feasible():
+    chains = attempt([1.0, np.nan, 2.0, 9.0], [0.0, 0.0, 0.0, 1.0], 100)
+    np.testing.assert_array_equal(chains.feasible, [True, False, True, False])
+    assert chains.sound_cost.min() == 1.0
+    np.testing.assert_array_equal(chains.order()[0], [0, 2, 3, 1])
+    best = best_of(chains, attempt([9.0] * 4, [0.0] * 4, 200), np.arange(4))
+    np.testing.assert_array_equal(best.feasible_since, [100, 201, 102, 203])
+
+
 def test_a_rollout_replaces_what_is_optimal_only_if_it_costs_clearly_less():
     def polished(chains, optimal):
         names = [f.name for f in fields(Progress)]
