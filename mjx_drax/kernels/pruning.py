@@ -41,8 +41,8 @@ def pruned(function: Function) -> Function:
     """The same function of pytrees of arrays, without the operations that its result does not need.
 
     XLA drops these, but only after JAX has differentiated and lowered them; and a step of physics
-    computes much that a cost does not read. Arguments of the same shapes are traced once; see
-    `forget`.
+    computes much that a cost does not read. Arguments of the same shapes are traced once, for each
+    precision of products; see `forget`.
     """
     traces = _Traces()
     _every.add(traces)
@@ -50,7 +50,8 @@ def pruned(function: Function) -> Function:
     @wraps(function)
     def lean(*arguments: Any) -> Any:
         inputs, structure = jax.tree.flatten(arguments)
-        asked = structure, *map(jax.typeof, inputs)
+        precision = jax.config.jax_default_matmul_precision  # type: ignore[attr-defined]
+        asked = structure, precision, *map(jax.typeof, inputs)
         known = traces.known
         if asked not in known:
             if len(known) == REMEMBERED:

@@ -92,6 +92,7 @@ def identity_of_rows(own: Any, shared: Any, **others: Any) -> str | None:
 
 
 @jax.jit
+@full_precision
 def begin(own: Question, shared: Question, knots: Trajectory, keys: Array) -> State:
     """The first state of chains that start at the given knots (rows, K, ...).
 
@@ -115,6 +116,7 @@ def chain_keys(key: Array, chains: int) -> Array:
 
 
 @jax.jit
+@full_precision
 def restart_at(own: Question, shared: Question, states: State, knots: Trajectory) -> State:
     """The chains with other knots (rows, K, ...), slacks that go with them, and a new polish.
 
@@ -132,6 +134,7 @@ def restart_at(own: Question, shared: Question, states: State, knots: Trajectory
 
 
 @jax.jit
+@full_precision
 def between(
     own: Question, shared: Question, here: Trajectory, there: Trajectory, share: ArrayLike
 ) -> Trajectory:
@@ -148,6 +151,7 @@ def between(
 
 
 @jax.jit
+@full_precision
 def worst_and_unit(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
     """What rows are judged by whose defects the replaying engine gives.
 
@@ -165,6 +169,7 @@ def worst_and_unit(own: Question, shared: Question, knots: Trajectory) -> tuple[
 
 
 @jax.jit
+@full_precision
 def box_of_controls(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
     """The ends of the box that each row's initial controls are drawn from, each (rows, K, nu)."""
 
@@ -178,6 +183,7 @@ def box_of_controls(own: Question, shared: Question, knots: Trajectory) -> tuple
 
 
 @jax.jit
+@full_precision
 def judged(own: Question, shared: Question, knots: Trajectory) -> tuple[Array, Array]:
     """Cost of rollouts (samples, rows, K, ...), and by how much they break what must hold.
 
@@ -387,5 +393,6 @@ def advance(
 def ranking(cost: ArrayLike, max_defect: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Sort keys of chains (...,), best first: infeasible, then cost, or max|h| if infeasible."""
     defect = np.nan_to_num(np.asarray(max_defect), nan=np.inf)
+    defect = np.where(np.isfinite(cost), defect, np.inf)
     infeasible = defect >= FEASIBLE
     return infeasible, np.where(infeasible, defect, np.asarray(cost))

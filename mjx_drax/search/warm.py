@@ -13,6 +13,7 @@ from jax import Array
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.method.langevin import State
 from mjx_drax.method.model import Multipliers
 from mjx_drax.polish.interior_point import Progress
@@ -100,6 +101,7 @@ def require_alike(problem: Problem, warm: Warm) -> None:
 
 
 @jax.jit
+@full_precision
 def warmed(own: Any, shared: Any, states: State, warm: Warm) -> State:
     """The chains at what is warm, bounds and inequalities barely kept."""
 

@@ -56,3 +56,11 @@ def test_pruned_functions_of_pytrees_return_the_same_pytrees():
     for a, b in zip(jax.tree.leaves(seen), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_array_equal(a, b)
     assert pruned(function).__name__ == "function"
+
+
+def test_products_have_the_precision_that_is_asked_for():
+    lean = pruned(lambda x: x @ x)
+    assert "HIGHEST" not in str(jax.make_jaxpr(lean)(jnp.ones(2)))
+    with jax.default_matmul_precision("float32"):
+        assert "HIGHEST" in str(jax.make_jaxpr(lean)(jnp.ones(2)))
+    assert "HIGHEST" not in str(jax.make_jaxpr(lean)(jnp.ones(2)))
