@@ -14,6 +14,7 @@ from mjx_drax.base.errors import DraxError, require_whole, shown
 from mjx_drax.method.descent import Info
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
+from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, evaluate, partition, residuals
 from mjx_drax.search.replayer import by_the_engine
 from mjx_drax.search.units import to_units
@@ -98,6 +99,7 @@ class Solution(Results):
                 tolerances that do not fit.
         """
         problem, u = self.problem, np.asarray(self.trajectories.u)
+        look_again(problem)
         chosen = self.tolerances if tolerances is None else as_tolerances(tolerances)
         family, plan = Family.of_one(problem), self.plans.astype(float)
         open_loop, feedback, gains = both_ways(family, plan, u, self.gains, chosen)

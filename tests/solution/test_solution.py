@@ -602,3 +602,13 @@ def test_where_f_has_kinks_plans_that_counted_are_judged_by_the_engine(monkeypat
     away = np.linspace(0.0, 1.0, found.problem.horizon)[:, None]
     moved = replace(found.trajectories, x=found.trajectories.x + away)
     assert not replace(found, trajectories=moved).certify().feasible.any()
+
+
+def test_numbers_that_functions_read_may_change_before_it_is_judged_again():
+    price = np.ones(2, np.float32)
+    problem = point(running_cost=lambda x, u: jnp.sum(price * u**2), terminal_residual=None)
+    found = solve(problem, chains=2, solver=Langevin(iterations=1, tail=1))
+    price *= 3.0
+    again = found.certify()
+    np.testing.assert_allclose(again.open_loop.cost, 3.0 * found.open_loop.cost, rtol=1e-5)
+    np.testing.assert_allclose(again.cost, 3.0 * found.cost, rtol=1e-5)
