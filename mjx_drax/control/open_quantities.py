@@ -19,6 +19,9 @@ from mjx_drax.problem.problem import Problem
 WIDTH = 0.01
 """Share of its range that stays open to a duration when its end is due."""
 
+SAME = 1e-3
+"""Share of a step below which two times are the same: those of plans may be in float32."""
+
 
 def require_plannable(problem: Problem) -> None:
     """Complain about what cannot be left open while a robot runs."""
@@ -140,6 +143,6 @@ class Applied:
         """
         given, found = self._given, [self._first]
         for i in range(self._order):
-            earlier = [u for time, u in given if time < t - i * step - 1e-9]
+            earlier = [u for time, u in given if time < t - (i + SAME) * step]
             found.append(earlier[-1] if earlier else found[-1])
         return np.concatenate(found[1:])

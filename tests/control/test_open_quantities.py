@@ -56,6 +56,9 @@ def test_the_last_controls_are_those_before_a_time():
         given.add(np.array([float(k)]), k * DT / 2, since=(k - 6) * DT / 2)
     np.testing.assert_array_equal(given.before(9.5 * DT, DT), [18.0, 16.0])
     assert len(given._given) < 10
+    step = float(np.float32(DT))  # of a plan: its times are not quite the same as those here
+    for k in (7, 8, 9):
+        np.testing.assert_array_equal(given.before(k * step, step)[:1], [2.0 * k - 1])
     given.add(np.array([-1.0]), 5 * DT, since=0.0)  # time has gone back
     np.testing.assert_array_equal(given.before(6 * DT, DT)[:1], [-1.0])
     known = Applied(limited().dynamics)
