@@ -125,8 +125,8 @@ def extend(
         u_init = np.asarray(vector("u_init", choices.u_init))
         if u_init.shape != (dynamics.nu,):
             raise DraxError(f"u_init has shape {u_init.shape}: give {dynamics.nu} numbers.")
-        lower, upper = (np.atleast_2d(e)[0] for e in (bounds.u_lower, bounds.u_upper))
-        if ((u_init < lower) | (u_init > upper)).any():
+        least, most = (np.atleast_2d(e)[0] for e in (bounds.u_lower, bounds.u_upper))
+        if ((u_init < least) | (u_init > most)).any():
             warnings.warn(
                 f"u_init is {u_init.tolist()}, outside of the controls' bounds, so the first rate "
                 "leads back from there: move it, or widen u_bounds.",

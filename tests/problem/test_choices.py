@@ -547,6 +547,19 @@ def test_a_last_control_outside_of_its_bounds_is_told():
         )
 
 
+def test_a_last_control_leaves_bounds_of_x_0_and_durations_as_they_are():
+    open_start = {"x_init_bounds": ([-0.1, 0.0], [0.1, 0.0]), "u_bounds": (-8.0, 8.0), "rates": 1}
+    costs = {"running_residual": lambda x, u, knot: knot.rate}
+    first, other = (
+        double_integrator(**open_start, **costs, **more) for more in ({}, {"u_init": [0.0]})
+    )
+    jax.tree.map(np.testing.assert_array_equal, other.bounds, first.bounds)
+    np.testing.assert_allclose(other.bounds.start_upper, [0.1])
+    first, other = (fastest(rates=1, **more) for more in ({}, {"u_init": [0.0]}))
+    jax.tree.map(np.testing.assert_array_equal, other.bounds, first.bounds)
+    jax.tree.map(np.testing.assert_array_equal, other.scatter, first.scatter)
+
+
 def test_windows_may_lie_within_the_longest_durations():
     slow = between(lambda x, u: u - 1.0, 4.0, 4.5)
     assert fastest(inequality=slow).horizon == 20
