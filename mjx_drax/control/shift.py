@@ -62,7 +62,7 @@ def shifted(flow: Langevin, problem: Problem, by: Array, state: State) -> State:
         polish = replace(polish, stalled=polish.stalled | ~state.alive)
         if isinstance(polish.secant, Secant):
             secant = polish.secant  # which a plan has no time to measure
-            secant = replace(secant, B=rows(secant.B), close=jnp.zeros_like(secant.close))
+            secant = replace(secant, B=rows(secant.B), age=jnp.zeros_like(secant.age))
             polish = replace(polish, secant=secant)
     return replace(
         state,

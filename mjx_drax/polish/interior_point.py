@@ -87,10 +87,10 @@ TRIES = 3
 NEAR = 0.02
 """Residual below which the curvature that stages have learned is used."""
 
-CLOSE, PATIENCE, MEASURED = 0.1, 3.0, 1.5
-"""Where f is smooth: a chain whose residual was below CLOSE for PATIENCE n iterations is slow, as n
-rank-one updates could have taught its stages all, n = ndx + nu. Then curvature is measured, once in
-MEASURED n iterations, and used below CLOSE."""
+PATIENCE, MEASURED = 3.0, 1.5
+"""Where f is smooth: a chain polished for PATIENCE n iterations is slow, n = ndx + nu: so many
+rank-one updates could have taught its stages all. Then curvature is measured, once in MEASURED n
+iterations, and used wherever the chain is."""
 
 BLOCKED, RAISE = 0.1, 3.0
 """Steps to the boundary shorter than BLOCKED raise the barrier's weight by a factor RAISE."""
@@ -253,7 +253,7 @@ def step(
         moves = jnp.concatenate([scales.x, scales.u])
         learned = learned.updated(*at, moves, learns=before.size > 0.0)
         if not problem.dynamics.kinked:
-            learned = _measured(problem, state, learned, derivatives.cost, residual, scales)
+            learned = _measured(problem, state, learned, derivatives.cost, scales)
     total = jnp.maximum(residual.total, before.promise)
     optimal = before.optimal | (total < polish.tolerance)
     now = replace(before, secant=learned, residual=total, cost=scales.cost, optimal=optimal)
@@ -273,15 +273,13 @@ def _measured(
     state: State,
     learned: Secant,
     cost: QuadraticCost,
-    residual: Residual,
     scales: Scales,
 ) -> Secant:
-    """What stages have learned; measured now and then where a chain is slow (CLOSE)."""
+    """What stages have learned; measured now and then where a chain is slow (PATIENCE)."""
     polish, n = state.polish, len(scales.x) + len(scales.u)
-    close = residual.total < CLOSE
-    learned = replace(learned, close=learned.close + close)
+    learned = replace(learned, age=learned.age + 1)
     turn = polish.iterations % math.ceil(MEASURED * n) == 0
-    due = polish.active & close & turn & _slow(learned)
+    due = polish.active & turn & _slow(learned)
 
     def measure(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         at = state.trajectory, state.multipliers
@@ -296,8 +294,8 @@ def _measured(
 
 
 def _slow(learned: Secant) -> Array:
-    """Whether a chain has been close to an optimum for longer than it should take to learn."""
-    return learned.close > PATIENCE * learned.B.shape[-1]
+    """Whether a chain has been polished for longer than it should take to learn."""
+    return learned.age > PATIENCE * learned.B.shape[-1]
 
 
 def _entered(
@@ -371,7 +369,7 @@ def _moved(
     model = replace(model, barrier=_barrier_model(problem, central, v, ends))
     cost, learned = derivatives.cost, None
     if isinstance(now.secant, Secant):
-        used = residual.total < jnp.where(_slow(now.secant), CLOSE, NEAR)
+        used = _slow(now.secant) | (residual.total < NEAR)
         learned = jnp.where(used, now.secant.B, 0.0)
     else:
         cost = with_exact_hessian(problem, knots, state.multipliers, cost, Autodiff())

@@ -9,8 +9,8 @@ After a step s = (dx_k, du_k), with the stage's Lagrangian l + lambda'f + nu'g a
 (the partitioned SR1 update; Griewank and Toint 1982, Bock and Plitt 1984); where that explodes, B_k
 changes as little as it can (`symmetric_update`). It needs no derivatives beyond Gauss-Newton's, so
 programs compile no longer for it. Far from an optimum what stages have learned is wrong one step
-later, so it is used near one only. Where a chain stays close to one for long and f is smooth, B_k
-is measured now and then (`curvature`), and learns on.
+later, so it is used near one only. Where a chain takes long and f is smooth, B_k is measured now
+and then (`curvature`), is used wherever the chain is, and learns on.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Secant:
         J: Jacobians of dynamics and constraints in (dx, du), (K, ndx + m, n).
         g: gradient of the running cost, (K, n).
         x, u: x_0..x_{K-1} and controls, (K, nx) and (K, nu).
-        close: for how many iterations the chain has been close to an optimum.
+        age: for how many iterations it has been learned.
     """
 
     B: Array
@@ -53,7 +53,7 @@ class Secant:
     g: Array
     x: Array
     u: Array
-    close: Array
+    age: Array
 
     @classmethod
     def none(cls, problem: Problem) -> Secant:
@@ -62,7 +62,7 @@ class Secant:
         n, rows = dynamics.ndx + dynamics.nu, dynamics.ndx + problem.constraint.rows
         shapes = (K, n, n), (K, rows, n), (K, n), (K, dynamics.nx), (K, dynamics.nu)
         B, J, g, x, u = map(jnp.zeros, shapes)
-        return cls(B, J, g, x, u, close=jnp.zeros((), int))
+        return cls(B, J, g, x, u, age=jnp.zeros((), int))
 
     def updated(
         self,
@@ -92,7 +92,7 @@ class Secant:
         r = jnp.where((jnp.abs(r) > noise).any(axis=1, keepdims=True), r, 0.0)
         learned = self.B + jax.vmap(symmetric_update, (0, 0, None))(r, s, moves)
         B = jnp.where(learns, learned, self.B)
-        return Secant(B, J, g, x, knots.u, self.close)
+        return Secant(B, J, g, x, knots.u, self.age)
 
 
 def with_curvature(cost: QuadraticCost, B: Array) -> QuadraticCost:

@@ -103,6 +103,30 @@ def test_a_free_start_is_chosen_within_its_bounds():
     assert found.certified
 
 
+@pytest.mark.slow
+def test_a_model_chooses_the_period_and_the_first_speed_of_a_swing():
+    """The cost is far from quadratic in both, so stages learn too little of it far out."""
+    text = """
+    <mujoco><option timestep="0.01"/><worldbody><body>
+      <joint name="h" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".02" mass="1"/>
+    </body></worldbody>
+    <actuator><motor joint="h" ctrlrange="-2 2"/></actuator></mujoco>"""
+    problem = from_mjcf(
+        text,
+        x_init=[0.8, 0.0],
+        horizon=(0.5, 3.0),
+        knots=60,
+        x_init_bounds=([0.8, -6.0], [0.8, 6.0]),
+        running_cost=lambda data, u, knot: knot.dt * u[0] ** 2,
+        terminal_equality=lambda data, knot: jnp.append(data.qpos, data.qvel) - knot.x_init,
+    )
+    found = solve(problem, chains=4)
+    assert found.optimal_chains.all()
+    # by SLSQP on a rollout of the same steps in numpy: 0.0257669
+    np.testing.assert_allclose(found.replay_cost, 0.0257669, rtol=1e-3)
+
+
 def test_a_start_at_an_end_of_its_bounds_is_inside_after_rounding():
     start = 100.1  # 1.5e-6 less in float32
     problem = double_integrator(
