@@ -6,8 +6,6 @@ can be reached in the given time, though perhaps not held.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from mjx_drax.base.errors import DraxError
@@ -18,7 +16,7 @@ from mjx_drax.physics.c_engine.states import Engine, between
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.mjcf import from_mjcf, steps_between_knots
 from mjx_drax.physics.mjx_model import free_ranges
-from mjx_drax.physics.source import load, model_name
+from mjx_drax.physics.source import Given, load, model_name
 from mjx_drax.problem.problem import Problem
 
 TOLERANCE = 0.02
@@ -30,7 +28,7 @@ and the factor on the controls from each of these to the next."""
 
 
 def reach(
-    source: str | Path | mujoco.MjModel,
+    source: Given,
     seed: int = 0,
     horizon: float = 0.3,
     name: str | None = None,
@@ -38,7 +36,7 @@ def reach(
     """Reach a random posture at the end of the horizon with little control.
 
     Args:
-        source: MJCF file, XML string or `mujoco.MjModel`.
+        source: MJCF file, XML string, `mujoco.MjSpec` or `mujoco.MjModel`.
         seed: of the posture.
         horizon: duration [s]; shorter where motions leave the ranges of joints before its end.
         name: by default the model's.

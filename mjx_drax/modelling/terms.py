@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -33,7 +32,7 @@ from mjx_drax.physics.joints import Joints
 from mjx_drax.physics.mjx_model import unknown_sensors
 from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.observed import not_computed
-from mjx_drax.physics.source import index, load
+from mjx_drax.physics.source import Given, index, load
 from mjx_drax.problem.cost import as_partial, at_knot, depends_on_knot
 from mjx_drax.problem.tracing import plain
 from mjx_drax.problem.trajectory import Knot
@@ -135,7 +134,7 @@ class Terms:
     for each of the knots 0..K, or a function of time [s] that returns (n,).
 
     Args:
-        model: MJCF file, XML string or `mujoco.MjModel`.
+        model: MJCF file, XML string, `mujoco.MjSpec` or `mujoco.MjModel`.
         actuators: as for `from_mjcf`, if the model gets them.
 
     Raises:
@@ -143,9 +142,7 @@ class Terms:
             negative weight, numbers that are not finite, or of the wrong size.
     """
 
-    def __init__(
-        self, model: str | Path | mujoco.MjModel, actuators: Actuators | None = None
-    ) -> None:
+    def __init__(self, model: Given, actuators: Actuators | None = None) -> None:
         self.model = load(model, actuators)
 
     def posture(

@@ -7,7 +7,6 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -28,7 +27,7 @@ from mjx_drax.physics.joints import HINGE, Joints
 from mjx_drax.physics.mjx_model import Stops, free_ranges, kept_contacts, put_model
 from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.near import affordable, without_own
-from mjx_drax.physics.source import load, model_name, origin_of
+from mjx_drax.physics.source import Given, load, model_name, origin_of
 from mjx_drax.problem.build import assembled, knots_in, of_phases, require_name, scatter_box
 from mjx_drax.problem.choices import Choices, parameter_ends, phases_of
 from mjx_drax.problem.differentiators import Differentiator
@@ -39,7 +38,7 @@ from mjx_drax.problem.trajectory import Box, Trajectory, box
 
 
 def from_mjcf(
-    model: str | Path | mujoco.MjModel,
+    model: Given,
     *,
     horizon: float | tuple[float, float] | Sequence[tuple[float, float]],
     knots: int | Sequence[int] | None = None,
@@ -82,7 +81,7 @@ def from_mjcf(
     intersected with `x_bounds` and `u_bounds`.
 
     Args:
-        model: MJCF file, XML string or `mujoco.MjModel`.
+        model: MJCF file, XML string, `mujoco.MjSpec` or `mujoco.MjModel`.
         horizon: duration [s]; K = horizon / dt knots, rounded with a warning. Or (least, most) of a
             free one, or a list of such pairs for phases: the model's timestep scales, in the plan
             and in the C engine.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,13 +25,13 @@ from mjx_drax.physics.mjx_model import (
 )
 from mjx_drax.physics.motors import Actuators
 from mjx_drax.physics.near import affordable, parts_differ, without_own
-from mjx_drax.physics.source import load, model_name
+from mjx_drax.physics.source import Given, load, model_name
 
 Report = dict[str, Any]
 
 
 def check(
-    source: str | Path | mujoco.MjModel,
+    source: Given,
     progress: Callable[[str], None] = lambda line: None,
     contacts: Contacts = True,
     actuators: Actuators | None = None,
@@ -40,7 +39,7 @@ def check(
     """What `mjx-drax check` prints, as numbers and words that JSON can hold.
 
     Args:
-        source: MJCF file, XML string or `mujoco.MjModel`.
+        source: MJCF file, XML string, `mujoco.MjSpec` or `mujoco.MjModel`.
         progress: called with a line before what takes long.
         contacts, actuators: as for `from_mjcf`.
 

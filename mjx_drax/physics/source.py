@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from typing import TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,6 +16,9 @@ from mjx_drax.base.errors import DraxError, cut, shown
 from mjx_drax.physics.c_engine.states import quiet
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.motors import Actuators, add_motors
+
+Given: TypeAlias = str | Path | mujoco.MjSpec | mujoco.MjModel
+"""As what models are given: a file, MJCF or URDF, the text of one, a spec, or compiled."""
 
 _FOLDER_OF = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
 
@@ -43,8 +47,8 @@ _COUNTS = {
 }
 
 
-def load(source: str | Path | mujoco.MjModel, actuators: Actuators | None = None) -> mujoco.MjModel:
-    """A model from a file, an XML string or a `mujoco.MjModel`.
+def load(source: Given, actuators: Actuators | None = None) -> mujoco.MjModel:
+    """A model from a file, an XML string, a `mujoco.MjSpec` or a `mujoco.MjModel`.
 
     Args:
         source: the model.
@@ -63,9 +67,11 @@ def load(source: str | Path | mujoco.MjModel, actuators: Actuators | None = None
     return model
 
 
-def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel:
+def _compiled(source: str | Path | mujoco.MjSpec, actuators: Actuators | None) -> mujoco.MjModel:
     try:
         with quiet():
+            if isinstance(source, mujoco.MjSpec):
+                return _spec(source.copy(), actuators).compile()  # the user's may change later
             if is_xml(source):
                 if actuators is not None:
                     return _spec(source, actuators).compile()
@@ -83,8 +89,8 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
         raise
     except TypeError as error:
         raise DraxError(
-            f"the model is {shown(source)}: give an MJCF file, its XML as a text, or a "
-            "mujoco.MjModel."
+            f"the model is {shown(source)}: give an MJCF file, its XML as a text, a "
+            "mujoco.MjSpec or a mujoco.MjModel."
         ) from error
     except (ValueError, OSError, mujoco.FatalError) as error:
         words = " ".join(str(error).split())
@@ -95,9 +101,11 @@ def _compiled(source: str | Path, actuators: Actuators | None) -> mujoco.MjModel
         ) from error
 
 
-def _spec(source: str | Path, actuators: Actuators | None) -> mujoco.MjSpec:
-    """What MuJoCo compiles, of a file or an XML string."""
-    if is_xml(source):
+def _spec(source: str | Path | mujoco.MjSpec, actuators: Actuators | None) -> mujoco.MjSpec:
+    """What MuJoCo compiles, of a file, an XML string or a spec, which gets the actuators."""
+    if isinstance(source, mujoco.MjSpec):
+        spec = source
+    elif is_xml(source):
         spec = mujoco.MjSpec.from_string(source)
     elif (urdf := _with_mesh_paths(Path(source))) is not None:
         spec = mujoco.MjSpec.from_string(urdf)
@@ -204,13 +212,13 @@ def is_binary(given: object) -> bool:
 
 
 def origin_of(
-    given: str | Path | mujoco.MjModel, model: mujoco.MjModel, actuators: Actuators | None = None
+    given: Given, model: mujoco.MjModel, actuators: Actuators | None = None
 ) -> str | Path | Source | None:
     """The MJCF that a model is given as: its XML, or its file's absolute path; or None.
 
     Where it gets actuators: its MJCF with them.
     """
-    if isinstance(given, mujoco.MjModel) or is_binary(given):
+    if isinstance(given, mujoco.MjModel | mujoco.MjSpec) or is_binary(given):
         return None
     if actuators is not None:
         return Source.of(given, model, actuators)

@@ -252,10 +252,25 @@ def test_the_initial_state_is_the_default_pose_or_the_first_keyframe_or_what_is_
     np.testing.assert_allclose(problem(arm(more=key), x_init=given).x_init, given)
 
 
-def test_a_model_is_a_file_a_string_or_an_mjmodel():
-    models = [path("pendulum"), str(path("pendulum")), path("pendulum").read_text()]
-    for model in [*models, mujoco.MjModel.from_xml_path(models[1])]:
+def test_a_model_is_a_file_a_string_a_spec_or_an_mjmodel():
+    file = str(path("pendulum"))
+    models = [path("pendulum"), file, path("pendulum").read_text(), mujoco.MjSpec.from_file(file)]
+    for model in [*models, mujoco.MjModel.from_xml_path(file)]:
         assert from_mjcf(model, horizon=0.1, running_residual=effort).name == "pendulum"
+
+
+def test_a_spec_may_be_changed_after_it_was_given_and_gets_motors():
+    spec = mujoco.MjSpec.from_string(arm())
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    made = from_mjcf(spec, horizon=0.1, running_residual=effort, actuators="torque")
+    assert made.dynamics.nu == made.dynamics.mj_model.njnt > 0
+    assert not spec.actuators
+    spec.option.timestep *= 2
+    assert made.dynamics.mj_model.opt.timestep == 0.5 * spec.option.timestep
+    spec.bodies[1].add_joint(name="another", range=[2.0, 1.0], limited=True)
+    with pytest.raises(DraxError, match="MuJoCo cannot compile"):
+        from_mjcf(spec, horizon=0.1, running_residual=effort)
 
 
 @pytest.mark.slow
