@@ -81,6 +81,7 @@ from mjx_drax.search.engine import Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.restarts import Restarts, settled
+from mjx_drax.search.unlimited import both_of, without_rollouts
 
 ENDLESS = 10**6
 """Iterations of the polish, of which none is the last one."""
@@ -186,15 +187,21 @@ class MPC:
             self.original, self.problem = problem, holding(problem, hold)
             look_again(self.problem)
             self.solver = settled(self.problem, chains, seed, solver)
+            polish = self.solver.polish
+            both = None
+            if polish is not None and polish.iterations and not problem.dynamics.kinked:
+                both = both_of(self.problem)
+            if both is not None:
+                self.problem, self.solver = both.first, without_rollouts(self.solver)
+        self._held = None if both is None else both.held
         metric = self.solver.flow.preconditioner
         if not metric.has_gains:
             raise DraxError(
                 f"preconditioner is {type(metric).__name__}, which brings no feedback gains: give "
                 "GaussNewton(), or a metric with has_gains = True."
             )
-        polish = self.solver.polish
         self._polish: Polish | None = None
-        if polish is not None and polish.iterations and is_constrained(problem):
+        if polish is not None and polish.iterations and is_constrained(self.problem):
             self._polish = replace(polish, iterations=ENDLESS)
         elif iterations > self.solver.flow.tail:
             raise DraxError(
@@ -257,7 +264,7 @@ class MPC:
         found = search.run()
         if found.interrupted:
             raise KeyboardInterrupt
-        self._flow = found.flow
+        self._flow, self._floor = found.flow, float(search.stage.floor[0])
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
         )
@@ -337,6 +344,8 @@ class MPC:
             self.statistics.unmeasured += 1
         if len(v):
             u = np.clip(u, *(v[: len(u)] + step * end for end in self._rate_ends))
+        if self._held is not None and np.isfinite(x).all():
+            u = self._held(x, u)
         u = np.clip(u, self._lower, self._upper)
         if applied is not None:
             applied.add(u, t, min(t, plan.time) - 2 * step)
@@ -390,7 +399,7 @@ class MPC:
         """What the next plan starts from, in the problem's precision; data of its knots."""
         dynamics, number = self.problem.dynamics, np.asarray(self.problem.x_init).dtype.type
         moved = self.problem if self.problem.data is None else self.problem.at_time(t)
-        cost = 1.0 if self._plan is None else float(abs(self._plan.cost))
+        cost = 1.0 if self._plan is None else abs(float(self._plan.cost) - self._floor)
         whole, before = np.append(np.asarray(x, number), self._further), None
         if self._applied is not None:
             v = self._applied.before(t, self._step).astype(number)
@@ -402,6 +411,7 @@ class MPC:
             by=number(by),
             iterations=np.int32(self.iterations),
             noise=number(np.sqrt(max(cost, 1e-12))),
+            floor=number(self._floor),
             passed=number(t - self._began),
             before=before,
         )

@@ -39,7 +39,8 @@ from mjx_drax.search.iterate import (
 from mjx_drax.search.warm import resumed
 
 CHEAPER = 0.9
-"""Another chain is applied if its cost is below that of the one applied by this factor."""
+"""Another chain is applied if its cost above the floor is less than this share of that of the one
+applied."""
 
 HEATED, CYCLE = 30, 50
 """Iterations of an explorer with noise, and of all, before it starts again."""
@@ -105,7 +106,8 @@ class Now(NamedTuple):
         t: its time [s].
         by: knots by which the last plan is moved forward.
         iterations: of every chain.
-        noise: unit of the explorers' noise, the root of the last plan's cost.
+        noise: unit of the explorers' noise, the root of the last plan's cost above the floor.
+        floor: what costs are measured from.
         passed: time since the policy began [s].
         before: the control that was applied last (nu,), and whether there is one; None without
             rates.
@@ -116,6 +118,7 @@ class Now(NamedTuple):
     by: Any
     iterations: Any
     noise: Any
+    floor: Any
     passed: Any
     before: Any
 
@@ -166,9 +169,7 @@ def planner_of(structure: Any, explorers: int) -> compiled:
         heated = replace(heated, scale=replace(heated.scale, noise=now.noise))
         present = at_present(problem, now.passed, now.before)
         present = replace(present, x_init=now.x, t_init=now.t, data=data)
-        after, plan = _plan(
-            flow, heated, polish, present, carried, now.by, now.iterations, explorers
-        )
+        after, plan = _plan(flow, heated, polish, present, carried, now, explorers)
         return after, packed(plan, packet.dtype)
 
     def key(leaves: list[Any], carried: Carried, packet: Array, data: Any) -> str | None:
@@ -190,6 +191,7 @@ def now_like(problem: Problem) -> Now:
         by=number,
         iterations=np.zeros((), np.int32),
         noise=number,
+        floor=number,
         passed=number,
         before=(np.zeros(dynamics.nu, number.dtype), np.zeros((), bool)) if rates else None,
     )
@@ -219,24 +221,24 @@ def _plan(
     polish: Polish | None,
     problem: Problem,
     carried: Carried,
-    by: Array,
-    iterations: Array,
+    now: Now,
     explorers: int,
 ) -> tuple[Carried, Plan]:
-    """Shift by `by` knots, iterate from x_init, and choose: one plan, all on the device."""
+    """Shift the chains, iterate from x_init, and choose: one plan, all on the device."""
+    by, iterations = now.by, now.iterations
     chains, best, age, key = len(carried.age), carried.best, carried.age, carried.key
     exploring = jnp.arange(chains) >= chains - explorers
     state = jax.vmap(partial(shifted, flow, problem, by))(carried.state)
     if explorers:
         key, fresh = jax.random.split(key)
         state = _restarted(heated, problem, state, best, exploring & (age == 0), fresh)
-    state = _led_back(flow, problem, state, carried)
+    state = _led_back(flow, problem, state, carried, alone=chains - explorers == 1)
     state = _iterated(flow, heated, polish, problem, state, age, iterations, explorers)
     age = jnp.where(exploring & (age + iterations < CYCLE), age + iterations, 0)
     info = evaluate(problem, state.trajectory)
     alive = state.alive & jnp.isfinite(info.cost) & jnp.isfinite(info.max_defect)
     cost = jnp.where(alive & (info.max_defect < FEASIBLE), info.cost, jnp.inf)
-    chosen = _chosen(info, cost, alive, best)
+    chosen = _chosen(info, cost, alive, best, now.floor)
     states = problem.with_start(state.trajectory)[chosen]
     plan = Plan(
         x=states,
@@ -260,19 +262,23 @@ def _plan(
     return Carried(_rows(state, source), best, lost, spare, age, key), plan
 
 
-def _chosen(info: Info, cost: Array, alive: Array, best: Array) -> Array:
+def _chosen(info: Info, cost: Array, alive: Array, best: Array, floor: Array) -> Array:
     """The chain to apply: of the feasible ones the cheapest, else the one with least max|h|.
 
     The one that was applied last has an advantage, so that plans do not alternate.
     """
     mine = jnp.arange(len(cost)) == best
-    cost = jnp.where(mine, cost - (1.0 - CHEAPER) * jnp.abs(info.cost), cost)
+    cost = jnp.where(mine, cost - (1.0 - CHEAPER) * jnp.abs(info.cost - floor), cost)
     defect = jnp.where(mine, CHEAPER, 1.0) * jnp.where(alive, info.max_defect, jnp.inf)
     return jnp.argmin(jnp.where(jnp.isfinite(cost).any(), cost, defect))
 
 
-def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) -> State:
+def _led_back(
+    flow: Langevin, problem: Problem, state: State, carried: Carried, alone: bool
+) -> State:
     """The spare keeper's knots replaced by a rollout of the applied plan, if that was lost.
+
+    A keeper that is alone is its own spare one.
 
     After a push the knots are far from any motion, and few iterations do not bring them back. The
     controls with their feedback, followed from x, give a motion to start from. It takes as many
@@ -291,7 +297,7 @@ def _led_back(flow: Langevin, problem: Problem, state: State, carried: Carried) 
         damping = jnp.where(which, 1.0, state.damping)
         return _begun_anew(replace(state, trajectory=new, damping=damping), which)
 
-    led: State = jax.lax.cond(carried.lost & (spare != best), rolled, lambda: state)
+    led: State = jax.lax.cond(carried.lost & (alone | (spare != best)), rolled, lambda: state)
     return led
 
 

@@ -308,6 +308,9 @@ class MjxDynamics(Dynamics):
             at_once=Partial(Ends.passed, at_once),
             all_along=Partial(Ends.passed, all_along),
             rows=2 * len(at_once.actuators),
+            held=partial(
+                jax.tree.map(lambda a: np.asarray(a, float), at_once).held, self.mj_model.nq
+            ),
         )
 
     def differentiator(self, by: Any) -> Any:

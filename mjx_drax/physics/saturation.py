@@ -26,6 +26,9 @@ FASTER = 20.0
 """How much faster than `dof_M0` says joints may gain speed: it is that of one posture, without what
 hits or carries them. With 2 the swing-up of a servo cost up to 1.3 times as much."""
 
+INSIDE = 1e-3
+"""Share of the controls between both ends by which `Ends.held` stays away from these."""
+
 
 @register_dataclass
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Ends:
     by_q: Array
     by_v: Array
 
-    def at(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+    def at(self, qpos: Any, qvel: Any) -> tuple[Any, Any]:
         """The ends (..., n)."""
         change = self.by_q * qpos[..., list(self.q)] + self.by_v * qvel[..., list(self.v)]
         return self.low + change, self.high + change
@@ -58,6 +61,18 @@ class Ends:
         low, high = self.at(data.qpos, data.qvel)
         own = u[jnp.array(self.actuators)]
         return jnp.concatenate([own - high, low - own])
+
+    def held(self, nq: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """The control (nu,) with forces INSIDE their ranges at a state (nx,), on the host.
+
+        A force at the end of its range has no slope: with the implicit integrators its actuator
+        then brings no damping, and joints gain speed several times as fast.
+        """
+        low, high = self.at(x[:nq], x[nq:])
+        inside, own = INSIDE * (high - low), list(self.actuators)
+        found = np.array(u)
+        found[own] = np.clip(found[own], low + inside, high - inside)
+        return found
 
 
 def ends_of(model: mjx.Model, time: float = 0.0) -> Ends | None:

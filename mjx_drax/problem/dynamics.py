@@ -40,6 +40,8 @@ class Unlimited(Generic[System]):
         all_along: the same of controls at whose ends forces are largest until the next knot, by an
             estimate: a motion should need none beyond.
         rows: of both.
+        held: the nearest control (nu,) to one that gives no force beyond its range at a state
+            (nx,), from both, on the host.
     """
 
     dynamics: System
@@ -47,6 +49,7 @@ class Unlimited(Generic[System]):
     at_once: Partial
     all_along: Partial
     rows: int
+    held: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class Dynamics:

@@ -48,11 +48,15 @@ Searched = Callable[[Problem, Restarts, Warm | None], tuple[Search, Found]]
 
 
 class Both(NamedTuple):
-    """The problems of the steps, and how many constraints of a stage each has besides."""
+    """The problems of the steps, and how many constraints of a stage each has besides.
+
+    `held` is that of `Unlimited`.
+    """
 
     first: Problem
     then: Problem
     rows: int
+    held: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def both_of(problem: Problem) -> Both | None:
@@ -64,7 +68,8 @@ def both_of(problem: Problem) -> Both | None:
         replace(problem, constraint=problem.constraint.with_inequality(ends, unlimited.rows))
         for ends in (unlimited.at_once, unlimited.all_along)
     )
-    return Both(replace(first, dynamics=unlimited.dynamics), then, unlimited.rows)
+    first = replace(first, dynamics=unlimited.dynamics)
+    return Both(first, then, unlimited.rows, unlimited.held)
 
 
 def is_motion(problem: Problem, guess: Trajectory | Warm | None, chains: int) -> bool:
@@ -83,9 +88,8 @@ def found_in_steps(
 ) -> tuple[Problem, Found]:
     """What the steps come to: the problem, in units of its constraints, and what was found."""
     assert settings.polish is not None  # for the type checker
-    smooth = replace(settings, rollouts=Rollouts(first=0, rounds=0))
     short = replace(settings, attempts=1, polish=replace(settings.polish, patience=1))
-    search, found = searched(both.first, smooth, None)
+    search, found = searched(both.first, without_rollouts(settings), None)
     every, least, chains = [found], _least(found), None
     gains_much = True
     if np.isfinite(least):
@@ -111,6 +115,11 @@ def found_in_steps(
         search, found = searched(problem, short, warm)
         return search.family.problem, _joined(every, _after(every, found))
     return given, _joined(every, replace(chains, state=state))
+
+
+def without_rollouts(settings: Restarts) -> Restarts:
+    """The same settings, for systems that nobody has: their replays would tell nothing."""
+    return replace(settings, rollouts=Rollouts(first=0, rounds=0))
 
 
 def _bear(both: Both, solved: Problem, chains: Chains, polish: Polish) -> np.ndarray:

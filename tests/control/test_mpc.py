@@ -136,6 +136,56 @@ def test_a_reset_has_what_functions_read_by_then():
 
 
 @pytest.mark.slow
+def test_a_chain_that_is_alone_is_led_back_after_a_push():
+    policy, x, defects = MPC(balance(), chains=1, iterations=1, solver=FAST), [6.0, -6.0], []
+    policy.reset([0.5, 0.0])
+    for k in (1, 2):
+        x = stepped(x, policy(x, k * DT))
+        defects.append(policy.statistics.max_defects[-1])
+    assert defects[1] < 0.2 * defects[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_servos_are_driven_up_to_where_their_forces_end_and_no_further(integrator):
+    text = f"""
+    <mujoco><option timestep="0.01" integrator="{integrator}"/><worldbody><body>
+      <joint name="one" axis="0 1 0" damping="0.3"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03" mass="1"/>
+    </body></worldbody><actuator>
+      <position joint="one" kp="60" kv="4" ctrlrange="-4 4" forcerange="-6 6"/>
+    </actuator></mujoco>"""
+
+    def off(data, u=0.0):
+        return jnp.concatenate([14.0 * (data.qpos - 1.0), 3.0 * data.qvel])
+
+    def running(data, u):
+        return jnp.concatenate([0.3 * data.qvel, 3.0 * (u - data.qpos)])
+
+    problem = from_mjcf(text, horizon=1.0, dt=0.02, running_residual=running, terminal_residual=off)
+    policy, plant, forces = MPC(problem, chains=2, explorers=0, solver=FAST), Plant(problem), []
+    policy.reset(plant.measured())
+    while plant.time < 2.0:
+        if plant.time == pytest.approx(1.0):
+            plant.data.qvel += 3.0
+        plant.step(policy(plant.measured(), plant.time))
+        forces.append(abs(plant.data.actuator_force[0]))
+    assert 5.9 < max(forces) < 6.0
+    assert np.mean(np.array(policy.statistics.max_defects) < 1e-3) > 0.9
+    np.testing.assert_allclose(plant.state, [1.0, 0.0], atol=0.05)
+
+
+@pytest.mark.slow
+def test_a_constant_in_the_cost_does_not_heat_explorers():
+    noise = []
+    for constant in (0.0, 100.0):
+        policy = MPC(balance(running_cost=lambda x, u, c=constant: c), chains=2, solver=FAST)
+        policy.reset([0.5, 0.0])
+        noise.append(policy._now(np.array([0.5, 0.0]), DT, 1.0)[0].noise)
+    assert noise[1] == pytest.approx(noise[0], rel=1e-2)
+
+
+@pytest.mark.slow
 def test_float64_stays_float64():
     with jax.enable_x64(True):
         policy = MPC(balance(), chains=2, explorers=1, hold=1.0, solver=FAST)

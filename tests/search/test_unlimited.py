@@ -49,7 +49,7 @@ def posed(forces="-4 4", joint="", option="", actuator=SERVO, **settings):
     ids=["servo", "implicit", "motor", "joint", "dry"],
 )
 def test_forces_have_no_ends_at_first_and_then_no_motion_is_lost(problem):
-    first, then, rows = both_of(problem)
+    first, then, rows, held = both_of(problem)
     rng = np.random.default_rng(0)
     x = jnp.asarray(rng.normal(size=(8, 2)), jnp.float32)
     far = jnp.asarray([[-290.0], [290.0]] * 4, jnp.float32)
@@ -76,11 +76,20 @@ def test_forces_have_no_ends_at_first_and_then_no_motion_is_lost(problem):
     step = jax.vmap(problem.dynamics.step)
     np.testing.assert_allclose(step(x, last), step(x, last + 9.0), atol=1e-6)
     np.testing.assert_allclose(step(x, least), step(x, least - 9.0), atol=1e-6)
+    # where controls are held within the ends, f is as if there were none
+    given = np.array([held(*each) for each in zip(np.asarray(x), np.asarray(far), strict=True)])
+    inside = jnp.asarray(given, jnp.float32)
+    true, free = (jax.vmap(of.dynamics.step)(x, inside) for of in (problem, first))
+    np.testing.assert_allclose(true, free, atol=1e-6)
+    assert np.all(passed(first, inside) < 0)
+    assert np.all(passed(first, inside).max(axis=1) > -1e-2 * np.ravel(high - low))
+    middle = 0.5 * np.asarray(low + high, float)
+    np.testing.assert_array_equal(held(np.asarray(x)[0], middle[0]), middle[0])
 
 
 def test_both_are_solved_by_one_program():
     problem = posed()
-    first, then, _ = both_of(problem)
+    first, then, *_ = both_of(problem)
     assert jax.tree.structure(first) == jax.tree.structure(then)
     shapes = [[jnp.shape(a) for a in jax.tree.leaves(problem)] for problem in (first, then)]
     assert shapes[0] == shapes[1]
