@@ -84,6 +84,11 @@ def phases_of(horizon: Any, knots: Any) -> tuple[tuple[float, float, int], ...]:
             "(least, most) with knots=K, or a list of pairs with a list of knots, for phases."
         )
     for (least, most), count in zip(pairs, counts, strict=True):
+        if count is None:
+            raise DraxError(
+                f"the duration is free, from {least:g} to {most:g} s, and knots is None: give "
+                "knots=K, as the step between them is found with the duration."
+            )
         require_whole("knots", count)
         if not (np.isfinite([least, most]).all() and 0 < least < most):
             raise DraxError(

@@ -211,6 +211,8 @@ def box(
             array = numbers(value)
             if np.isnan(array).any():
                 raise ValueError("NaN is no bound")
+            if array.ndim and array.shape[-1] != size:
+                raise ValueError("one number in a list is meant for one entry")
             return jnp.asarray(np.broadcast_to(array, (*array.shape[:-1], size)))
         except (TypeError, ValueError) as error:
             raise DraxError(

@@ -26,10 +26,13 @@ from mjx_drax.method.schedules import Scale
 from mjx_drax.problem.differentiators import Autodiff
 from mjx_drax.problem.problem import STEP, Problem, functions_of
 from mjx_drax.problem.tracing import require_derivatives
-from mjx_drax.problem.trajectory import Knot, Trajectory
+from mjx_drax.problem.trajectory import Box, Knot, Trajectory
 from mjx_drax.search.iterate import FEASIBLE
 
 _POSITIVE, _COUNTS = {"floor", "fraction", "radius"}, {"pairs", "inner"}
+
+FAR = 1e6
+"""So many times as far as initial knots reach only what runs away gets."""
 
 
 def check_flow(flow: Langevin, problem: Problem) -> None:
@@ -195,6 +198,12 @@ def require_sound(
             if problem.dynamics.nx:
                 at = "the last initial state" if label.startswith("terminal") else "x_init"
                 move = "x_init or the scatter of initial knots"
+            if (label, what) in _finite_in_float64(flow, problem, knots, with_f):
+                raise DraxError(
+                    f"the {what} of {label} is not finite at {at} in float32, whose numbers end "
+                    "at 3e38, but in float64: give precision=64, or measure in other units, so "
+                    "that powers of large numbers stay below that."
+                )
             raise DraxError(
                 f"the {what} of {label} is not finite at {at} for any of {len(good)} chains: "
                 "change it (no 0/0, no log or sqrt of 0; sqrt(y + 1e-6) has a derivative), or "
@@ -204,6 +213,23 @@ def require_sound(
         u = np.asarray(stages)[:, 0, problem.dynamics.nx :]
         at_start = {n: a for n, a in constraints.items() if not n.startswith("terminal")}
         _warn_of_start(u, {name: np.asarray(a)[:, 0] for name, a in at_start.items()})
+
+
+def _finite_in_float64(
+    flow: Langevin, problem: Problem, knots: Trajectory, with_f: bool
+) -> set[tuple[str, str]]:
+    """What of which functions is finite for a chain's knots in float64; nothing if that fails."""
+    if problem.precision == 64:
+        return set()
+    try:
+        double = problem.in_float64()
+        with double.arithmetic():
+            wide = jax.tree.map(lambda a: jnp.asarray(a, float), knots)
+            starts = _starts(flow, double, wide)
+            finite, _ = _finite(double, *starts, _in_forward(flow, double), with_f)
+            return {(f, what) for f, what, good in _by_function(double, finite) if good.any()}
+    except Exception:  # a user's functions may be made for float32
+        return set()
 
 
 def _warn_of_start(u: np.ndarray, constraints: dict[str, np.ndarray]) -> None:
@@ -255,12 +281,26 @@ def require_alive(flow: Langevin, problem: Problem, knots: Trajectory, died_at: 
         if not good.all(axis=1).any():
             k = int(np.argmin(good[0]))
             at = "the last state" if label.startswith("terminal") else f"knot {k}"
+            largest = float(jnp.abs(end if label.startswith("terminal") else stages).max())
+            if largest > FAR * float(_largest(problem.scatter)):
+                raise DraxError(
+                    f"the {what} of {label} is not finite at {at}, of all {len(good)} chains after "
+                    f"at most {int(died_at.max()) + 1} iterations, where states or controls have "
+                    f"grown to {largest:.1g}: the cost may have no least value, or f may not stay "
+                    "finite. Bound states and controls."
+                )
             raise DraxError(
                 f"the {what} of {label} is not finite at {at}, of all {len(good)} chains after "
                 f"at most {int(died_at.max()) + 1} iterations: change it (no 0/0, no log or "
                 "sqrt of what may be 0 or negative; sqrt(y + 1e-6) has a derivative), or bound "
                 "the states and controls to where it is finite."
             )
+
+
+def _largest(box: Box) -> Array:
+    """The largest of all ends that are finite; 1 if that is less."""
+    ends = (jnp.where(jnp.isfinite(end), jnp.abs(end), 0.0) for end in jax.tree.leaves(box))
+    return jnp.max(jnp.stack([jnp.ones(()), *(end.max(initial=0.0) for end in ends)]))
 
 
 def _by_function(

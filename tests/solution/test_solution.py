@@ -385,6 +385,20 @@ def test_a_cost_or_dynamics_that_are_nan_everywhere_are_refused(no_compilation):
             solve(reach(**part), chains=3, solver=QUICK)
 
 
+def test_numbers_that_float32_cannot_hold_are_told_from_faults(no_compilation):
+    wide = reach(terminal_cost=lambda x: ((x[0] - 9.0) * 1e25) ** 2)
+    with pytest.raises(DraxError, match=r"value of terminal_cost .* float32, .* precision=64"):
+        solve(wide, chains=3, solver=QUICK)
+    with pytest.raises(DraxError, match=r"terminal_cost is not finite at .* \(no 0/0"):
+        solve(reach(terminal_cost=lambda x: x[0] / 0.0), chains=3, solver=QUICK)
+
+
+def test_a_cost_without_a_least_value_is_told_from_faults():
+    endless = point(running_cost=lambda x, u: -jnp.sum(u**2), terminal_residual=None)
+    with pytest.raises(DraxError, match=r"have grown to .*: the cost may have no least value"):
+        solve(endless, chains=3, solver=Langevin(iterations=300, tail=1))
+
+
 @pytest.mark.slow
 def test_a_models_cost_that_is_nan_everywhere_is_refused(no_compilation):
     for cost, words in (
@@ -439,6 +453,7 @@ def test_counts_that_are_refused(no_compilation):
     ("arguments", "words"),
     [
         ({"u_bounds": ([-1.0, -1.0], [1.0, 1.0])}, r"lower end of u.*\(1,\)"),
+        ({"x_bounds": ([-1.0], [1.0])}, r"lower end of x.*\(2,\)"),
         ({"x_bounds": ([-1.0] * 3, 1.0)}, r"lower end of x.*\(2,\)"),
         ({"x_bounds": (-np.ones((K + 3, 2)), 9.0)}, "lower end of x|bounds of x"),
         ({"f": lambda x, u: x[:1]}, r"dynamics f\(x, u\) returned shape \(1,\)"),
