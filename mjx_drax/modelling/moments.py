@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError, is_number, shown
 from mjx_drax.base.pytrees import register_dataclass
+from mjx_drax.modelling.terms import Term, sum_of
 from mjx_drax.problem.cost import as_partial, at_knot
 from mjx_drax.problem.trajectory import Knot
 
@@ -41,6 +42,14 @@ class Windowed:
     def __call__(self, *arguments: Any, knot: Knot) -> Array:
         """The function's value, or `idle` for each of its entries."""
         return jnp.where(self.active(knot), at_knot(self.function, knot)(*arguments), self.idle)
+
+    def __add__(self, other: Callable[..., Any] | int) -> Term:
+        """Both vectors in one, as terms are added: for several waypoints."""
+        return sum_of(self) if isinstance(other, int) and other == 0 else sum_of(self, other)
+
+    def __radd__(self, other: Callable[..., Any] | int) -> Term:
+        """The same, the other one's first."""
+        return sum_of(self) if isinstance(other, int) and other == 0 else sum_of(other, self)
 
     def active(self, knot: Knot) -> Array:
         """Whether the function counts at a knot."""

@@ -108,14 +108,15 @@ class Term:
 
     def __add__(self, other: Callable[..., Array] | int) -> Term:
         """Both residuals in one vector, this one's first; `sum` of terms works as well."""
-        return self if isinstance(other, int) and other == 0 else _sum(self, other)
+        return self if isinstance(other, int) and other == 0 else sum_of(self, other)
 
     def __radd__(self, other: Callable[..., Array] | int) -> Term:
         """The same, the other one's first."""
-        return self if isinstance(other, int) and other == 0 else _sum(other, self)
+        return self if isinstance(other, int) and other == 0 else sum_of(other, self)
 
 
-def _sum(*parts: Any) -> Term:
+def sum_of(*parts: Any) -> Term:
+    """The vectors of all parts in one, the first part's first."""
     if not all(callable(part) for part in parts):
         raise DraxError(f"{parts} cannot be added: add terms, or functions that return vectors.")
     return Term(_stacked, (), tuple(map(as_partial, parts)), jnp.ones(()))

@@ -132,7 +132,9 @@ def constraints(solution: Results) -> str:
     """The largest violation of each kind on the best chain's better replay."""
     violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
     told = [
-        f"{words(v.kind)} {v.size:.1e} (tolerated: {v.allowed:.1e})"
+        f"{words(v.kind)} none"
+        if v.size == v.allowed == 0.0  # as where the largest is at a knot that asks nothing
+        else f"{words(v.kind)} {v.size:.1e} (tolerated: {v.allowed:.1e})"
         for v in violations
         if v.kind not in (GOAL, TRACKING)
     ]

@@ -285,3 +285,26 @@ def test_a_reference_before_its_first_row_is_that_row():
     reference = Reference(jnp.arange(5.0)[:, None])
     rows = [float(reference.at(Knot(index=i, stage=i, time=0.0, dt=0.1))[0]) for i in (-2, 1, 9)]
     assert rows == [0.0, 1.0, 4.0]
+
+
+FIRST, SECOND = (at_time(lambda x, u, p=p: x[:1] - p, t) for p, t in ((0.5, 0.5), (-0.5, 1.0)))
+
+
+def test_waypoints_are_added():
+    for equality in (FIRST + SECOND, sum([FIRST, SECOND]), FIRST + (lambda x, u: x[:1])):
+        assert double_integrator(running_residual=SECOND, equality=equality).constraint.rows == 2
+    late = at_time(lambda x, u: x[:1], 9.0)
+    with pytest.raises(DraxError, match="equality holds at 9 s, where it has no knot"):
+        double_integrator(equality=FIRST + late, running_residual=FIRST)
+
+
+@pytest.mark.slow
+def test_added_waypoints_are_passed():
+    problem = double_integrator(
+        running_residual=lambda x, u: 0.1 * u,
+        equality=FIRST + SECOND,
+        terminal_equality=lambda x: x,
+    )
+    found = solve(problem, chains=2)
+    np.testing.assert_allclose(found.best.x[[4, 9], 0], [0.5, -0.5], atol=1e-3)
+    assert found.certified
