@@ -399,7 +399,10 @@ class MPC:
         """What the next plan starts from, in the problem's precision; data of its knots."""
         dynamics, number = self.problem.dynamics, np.asarray(self.problem.x_init).dtype.type
         moved = self.problem if self.problem.data is None else self.problem.at_time(t)
-        cost = 1.0 if self._plan is None else abs(float(self._plan.cost) - self._floor)
+        cost = 1.0
+        if self._plan is not None:  # a floor that is too high makes nothing larger
+            last = float(self._plan.cost)
+            cost = min(abs(last), abs(last - self._floor))
         whole, before = np.append(np.asarray(x, number), self._further), None
         if self._applied is not None:
             v = self._applied.before(t, self._step).astype(number)

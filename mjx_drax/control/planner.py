@@ -39,8 +39,8 @@ from mjx_drax.search.iterate import (
 from mjx_drax.search.warm import resumed
 
 CHEAPER = 0.9
-"""Another chain is applied if its cost above the floor is less than this share of that of the one
-applied."""
+"""Another chain is applied if its cost is below that of the one applied by this factor: the cost
+itself, or from its floor, where that is smaller."""
 
 HEATED, CYCLE = 30, 50
 """Iterations of an explorer with noise, and of all, before it starts again."""
@@ -106,8 +106,8 @@ class Now(NamedTuple):
         t: its time [s].
         by: knots by which the last plan is moved forward.
         iterations: of every chain.
-        noise: unit of the explorers' noise, the root of the last plan's cost above the floor.
-        floor: what costs are measured from.
+        noise: unit of the explorers' noise, the root of the last plan's cost.
+        floor: the least that costs may be, about; see `search.sizes`.
         passed: time since the policy began [s].
         before: the control that was applied last (nu,), and whether there is one; None without
             rates.
@@ -268,7 +268,8 @@ def _chosen(info: Info, cost: Array, alive: Array, best: Array, floor: Array) ->
     The one that was applied last has an advantage, so that plans do not alternate.
     """
     mine = jnp.arange(len(cost)) == best
-    cost = jnp.where(mine, cost - (1.0 - CHEAPER) * jnp.abs(info.cost - floor), cost)
+    size = jnp.minimum(jnp.abs(info.cost), jnp.abs(info.cost - floor))
+    cost = jnp.where(mine, cost - (1.0 - CHEAPER) * size, cost)
     defect = jnp.where(mine, CHEAPER, 1.0) * jnp.where(alive, info.max_defect, jnp.inf)
     return jnp.argmin(jnp.where(jnp.isfinite(cost).any(), cost, defect))
 
