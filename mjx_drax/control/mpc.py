@@ -188,7 +188,7 @@ class MPC:
             look_again(self.problem)
             self.solver = settled(self.problem, chains, seed, solver)
             polish = self.solver.polish
-            both = None
+            both = None  # with contacts, the polish that keeps forces in range takes too long
             if polish is not None and polish.iterations and not problem.dynamics.kinked:
                 both = both_of(self.problem)
             if both is not None:

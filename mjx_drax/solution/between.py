@@ -40,7 +40,7 @@ def broken_between_knots(solution: Results, chain: int) -> Violation | None:
     allowed = np.maximum(allowed[:, :-1], most[:, 1:])
     if not (size > allowed).any():
         return None
-    share = size / np.maximum(allowed, np.finfo(float).tiny)
+    share = np.where(size > allowed, size / np.maximum(allowed, np.finfo(float).tiny), 0.0)
     at = np.unravel_index(np.argmax(share), size.shape)
     return Violation(INEQUALITY, float(size[at]), float(allowed[at]), int(at[2]), int(at[1]))
 
