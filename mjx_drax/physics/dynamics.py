@@ -298,7 +298,12 @@ class MjxDynamics(Dynamics):
         return None if self.kinked else useful_controls(self.model, x)
 
     def unlimited(self) -> Unlimited[MjxDynamics] | None:
-        """The same with `saturation.unlimited` actuators; the C engine keeps the model as it is."""
+        """The same with `saturation.unlimited` actuators; the C engine keeps the model as it is.
+
+        None where parameters change the model: the ends may be among what they change.
+        """
+        if self.numbers is not None:
+            return None
         at_once, all_along = (finite_ends(self.model, time) for time in (0.0, float(self.dt)))
         if at_once is None or all_along is None:
             return None

@@ -25,7 +25,7 @@ from jax.tree_util import Partial
 from mjx_drax.base.pytrees import Static, register_dataclass
 from mjx_drax.problem import rollout
 from mjx_drax.problem.cost import as_partial, at_knot
-from mjx_drax.problem.dynamics import Dynamics
+from mjx_drax.problem.dynamics import Dynamics, Unlimited
 from mjx_drax.problem.trajectory import Knot, Trajectory
 
 
@@ -117,6 +117,23 @@ class Extended(Dynamics):
     def useful_controls(self, x: Array) -> tuple[Array, Array] | None:
         """Those of the inner dynamics."""
         return self.inner.useful_controls(self.inner_state(x))
+
+    def unlimited(self) -> Unlimited[Extended] | None:
+        """With the inner system's, at the inner state."""
+        own = self.inner.unlimited()
+        if own is None:
+            return None
+        at_once, all_along = with_knot(own.at_once), with_knot(own.all_along)
+        assert at_once is not None  # for the type checker
+        assert all_along is not None
+        return Unlimited(
+            replace(self, inner=own.dynamics),
+            useful=lambda x: own.useful(self.inner_state(x)),
+            at_once=at_once,
+            all_along=all_along,
+            rows=own.rows,
+            held=own.held,
+        )
 
     def here(self, x: Array, u: Array) -> Knot:
         """The knot of (x', u), with all that functions may ask it for."""

@@ -87,6 +87,28 @@ def test_forces_have_no_ends_at_first_and_then_no_motion_is_lost(problem):
     np.testing.assert_array_equal(held(np.asarray(x)[0], middle[0]), middle[0])
 
 
+def test_forces_are_kept_in_range_beside_rates_but_not_where_parameters_change_the_model():
+    def rated(data, u, knot):
+        return 0.01 * knot.rate
+
+    given = {"running_residual": rated, "rates": 1}
+    x, u = jnp.array([0.3, -2.0]), jnp.array([290.0])
+    for plain, other in zip(both_of(posed())[:2], both_of(posed(**given))[:2], strict=True):
+        here = other.at(other.knots.at(0))
+        expected = plain.running_constraint(x, u)
+        np.testing.assert_allclose(here.running_constraint(jnp.append(x, 0.0), u), expected)
+        steps = plain.dynamics.step(x, u), here.dynamics.step(jnp.append(x, 0.0), u)
+        np.testing.assert_allclose(steps[1], jnp.append(steps[0], u))
+    changed = posed(
+        **given,
+        parameters={"k": (50.0, 70.0)},
+        model_numbers=lambda model, p: {
+            "actuator_gainprm": model.actuator_gainprm.at[0, 0].set(p["k"])
+        },
+    )
+    assert both_of(changed) is None
+
+
 def test_both_are_solved_by_one_program():
     problem = posed()
     first, then, *_ = both_of(problem)
