@@ -22,10 +22,13 @@ What a problem leaves open:
     rates         are counted from the controls that the policy gave last, and kept within their
                   bounds, from those before each knot, by feedback too
     parameters    every plan chooses its own (`MPC.parameters`)
-    duration      ends no later than at the first plan, so that less is left of it from plan to
-                  plan, but no plan is shorter than its lower bound: in the end the policy holds
-                  what the problem asks of the end. Controls are given by time along the plan, and
-                  `every` counts its steps
+    duration      ends within its upper bound from when the policy began, so that less is left of it
+                  from plan to plan, but no plan is shorter than its lower bound: in the end the
+                  policy holds what the problem asks of the end. Controls are given by time along
+                  the plan, and `every` counts its steps
+
+Where actuators' forces have ends, and f no kinks, plans have forces without ends that are kept in
+range (`search.unlimited`), and each control is moved to where its force is just inside.
 
 A goal at the end of a horizon that recedes may never be reached: tomorrow is as good. So the
 terminal cost also runs along the horizon, with the weight `hold`.

@@ -83,8 +83,8 @@ def step_of(problem: Problem, states: Array) -> Array:
 def at_present(problem: Problem, passed: Array, before: tuple[Array, Any] | None) -> Problem:
     """The problem when time `passed` [s] has gone since a policy began.
 
-    A free duration ends no later than at first, but has its least length. Rates are counted from
-    the last control, `before` = (u (nu,), whether there is one); None without rates.
+    A free duration ends within its upper bound from then, but has its least length. Rates are
+    counted from the last control, `before` = (u (nu,), whether there is one); None without rates.
     """
     dynamics, box = problem.dynamics, problem.bounds
     if not isinstance(dynamics, Extended):
