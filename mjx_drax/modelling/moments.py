@@ -45,11 +45,11 @@ class Windowed:
 
     def __add__(self, other: Callable[..., Any] | int) -> Term:
         """Both vectors in one, as terms are added: for several waypoints."""
-        return sum_of(self) if isinstance(other, int) and other == 0 else sum_of(self, other)
+        return sum_of(self, other)
 
     def __radd__(self, other: Callable[..., Any] | int) -> Term:
         """The same, the other one's first."""
-        return sum_of(self) if isinstance(other, int) and other == 0 else sum_of(other, self)
+        return sum_of(other, self)
 
     def active(self, knot: Knot) -> Array:
         """Whether the function counts at a knot."""

@@ -108,17 +108,24 @@ class Term:
 
     def __add__(self, other: Callable[..., Array] | int) -> Term:
         """Both residuals in one vector, this one's first; `sum` of terms works as well."""
-        return self if isinstance(other, int) and other == 0 else sum_of(self, other)
+        return sum_of(self, other)
 
     def __radd__(self, other: Callable[..., Array] | int) -> Term:
         """The same, the other one's first."""
-        return self if isinstance(other, int) and other == 0 else sum_of(other, self)
+        return sum_of(other, self)
 
 
-def sum_of(*parts: Any) -> Term:
-    """The vectors of all parts in one, the first part's first."""
+def sum_of(*given: Any) -> Term:
+    """The vectors of all parts in one, the first part's first; without 0, which `sum` begins with.
+
+    Raises:
+        DraxError: a part is no function.
+    """
+    parts = [part for part in given if not (isinstance(part, int) and part == 0)]
+    if len(parts) == 1 and isinstance(parts[0], Term):
+        return parts[0]
     if not all(callable(part) for part in parts):
-        raise DraxError(f"{parts} cannot be added: add terms, or functions that return vectors.")
+        raise DraxError(f"{given} cannot be added: add terms, or functions that return vectors.")
     return Term(_stacked, (), tuple(map(as_partial, parts)), jnp.ones(()))
 
 

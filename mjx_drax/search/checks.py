@@ -281,19 +281,21 @@ def require_alive(flow: Langevin, problem: Problem, knots: Trajectory, died_at: 
         if not good.all(axis=1).any():
             k = int(np.argmin(good[0]))
             at = "the last state" if label.startswith("terminal") else f"knot {k}"
+            grown = ""
+            fix = (
+                "change it (no 0/0, no log or sqrt of what may be 0 or negative; sqrt(y + 1e-6) "
+                "has a derivative), or bound the states and controls to where it is finite"
+            )
             largest = float(jnp.abs(end if label.startswith("terminal") else stages).max())
             if largest > FAR * float(_largest(problem.scatter)):
-                raise DraxError(
-                    f"the {what} of {label} is not finite at {at}, of all {len(good)} chains after "
-                    f"at most {int(died_at.max()) + 1} iterations, where states or controls have "
-                    f"grown to {largest:.1g}: the cost may have no least value, or f may not stay "
-                    "finite. Bound states and controls."
+                grown = f", where states or controls have grown to {largest:.1g}"
+                fix = (
+                    "the cost may have no least value, or f may not stay finite. Bound states and "
+                    "controls"
                 )
             raise DraxError(
                 f"the {what} of {label} is not finite at {at}, of all {len(good)} chains after "
-                f"at most {int(died_at.max()) + 1} iterations: change it (no 0/0, no log or "
-                "sqrt of what may be 0 or negative; sqrt(y + 1e-6) has a derivative), or bound "
-                "the states and controls to where it is finite."
+                f"at most {int(died_at.max()) + 1} iterations{grown}: {fix}."
             )
 
 

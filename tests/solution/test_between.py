@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from builders import made_up, point
 
-from mjx_drax import from_mjcf
+from mjx_drax import Tolerances, from_mjcf
 from mjx_drax.solution.between import broken_between_knots
 
 SLED = """
@@ -45,6 +45,19 @@ def test_a_wall_that_is_jumped_between_two_knots_is_told():
     assert "between knots 5 and 6, after 0.5 s, inequality [1] is broken by 3.0e-02" in str(
         solution
     )
+
+
+def test_of_several_the_one_that_is_broken_most_by_its_tolerance_is_told():
+    def two(data, u):
+        wall_in_mm = 30.0 - 1e3 * jnp.abs(data.qpos[0] - 0.55)
+        return jnp.stack([0.01 * wall_in_mm, 0.03 - jnp.abs(data.qpos[0] - 0.75)])
+
+    given = gliding(inequality=two)
+    found = replace(given, tolerances=Tolerances(inequality=[1.0, 1e-4]))
+    # by 0.3 where 1.0 is allowed is nothing; by 0.03 where 1e-4 is
+    assert broken_between_knots(found, 0).entry == 1
+    found = replace(given, tolerances=Tolerances(inequality=[1e-1, 1e-4]))
+    assert broken_between_knots(found, 0).entry == 1  # 3 times, and 300 times what is allowed
 
 
 def once(data, u, knot):
