@@ -87,13 +87,14 @@ class AttemptSoFar:
     def over(self) -> bool:
         """Whether to end the attempt, where a finish will polish the places that are left.
 
-        First case: enough chains are done, and there are more places than are wanted. (Else the
-        finish is the same as waiting.) Second case: another attempt is needed, and would bring more
-        than waiting. Of waiting one place more is expected than came since this was asked last
-        (Laplace's rule of succession), so that a few do not decide by chance.
+        First case: it only explores, and half a place or less is expected to bring what none of
+        those that have settled did. Second case: enough chains are done, and there are more places
+        than are wanted. (Else the finish is the same as waiting.) Third case: another attempt is
+        needed, and would bring more than waiting. Both expect one place more than came (Laplace's
+        rule of succession), so that a few do not decide by chance.
         """
         if self.explores:
-            return False
+            return bool(2 * self.waited_for.sum() <= (~self.active).sum() + 2)
         if self.missing(self.near & ~self.active) <= 0.0:
             return len(self.active) > self.wanted
         if self.missing(self.hopeful) <= 0.0:

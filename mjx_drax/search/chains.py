@@ -110,8 +110,8 @@ class Stage:
         before: `now.sound_cost` when it was asked last whether to wait, (rows,).
         damping: of each row between rollouts, (rows,); inf for rows that they cannot improve.
         step: how many of the attempt's iterations are done.
-        ends: of a single problem, `sound_cost` of the places when the latest attempts without and
-            with noise ended, and places times iterations of these, `work` (2,).
+        ends: of a single problem, `sound_cost` of the places at the ends of all attempts without
+            noise, and of all with it; and places times iterations of these, `work` (2,).
         rollouts: how many rollouts, and rounds of them, are done.
         records: iterations done and diagnostics of the best places, as many as there are chains,
             for every report of a single problem.

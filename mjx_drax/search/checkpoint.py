@@ -44,7 +44,7 @@ EVERY = 30.0
 SHARE = 0.05
 """Largest share of a solve's time that writing them may take; beyond, fewer are written."""
 
-FORMAT = 7
+FORMAT = 8
 """Changes whenever files that were written before can no longer be read."""
 
 HEADERS = 1_000_000

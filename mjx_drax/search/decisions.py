@@ -21,7 +21,7 @@ from mjx_drax.search.attempts import (
 )
 from mjx_drax.search.chains import CHEAPER, Chains, Stage
 from mjx_drax.search.devices import on_host
-from mjx_drax.search.restarts import Restarts
+from mjx_drax.search.restarts import WITHIN_KINKED, Restarts
 
 STRAGGLERS = 0.0005
 """Share of chains for which the polish of the others does not wait."""
@@ -139,6 +139,9 @@ class Decisions:
         done; from then on they are of the kind that has brought more. In a batch, where answers
         must not depend on others, all have noise, or none.
 
+        Where chains cost at most `WITHIN_KINKED` more than the best, no more attempts are made if
+        all that are left are not expected to make half of the missing ones done.
+
         Args:
             stage: all that is kept.
             first: places of the first attempt.
@@ -146,7 +149,8 @@ class Decisions:
         kept, everyone = stage.kept, np.arange(len(stage.cost_scale))
         assert kept is not None
         bar = self.done_up_to(stage, everyone)
-        missing = (self.sound_costs(stage, kept, everyone) > bar).sum(axis=1)
+        costs = self.sound_costs(stage, kept, everyone)
+        missing = (costs > bar).sum(axis=1)
         found = np.array([(end - stage.floor[0] <= bar[0]).sum() for end in stage.ends])
         many = self.chains
         if self.alone and stage.attempt == 0:
@@ -159,7 +163,15 @@ class Decisions:
                 heated = better if found.any() else not stage.heated
             elif stage.attempt > 0 and not self.thorough:
                 heated &= better
-        asked = missing > (1.0 - self.done_share) * many
+        needless = (1.0 - self.done_share) * many
+        asked = missing > needless
+        if self.alone and stage.attempt > 0 and not self.thorough:
+            far = self.done_up_to(stage, everyone, within=WITHIN_KINKED)
+            kind, left = int(heated), self.settings.attempts - 1 - stage.attempt
+            rate = (found[kind] + 1) / max(len(stage.ends[kind]), 1)
+            asked &= ((costs > far).sum(axis=1) > needless) | (
+                2 * rate * left * len(stage.now.missed) >= missing
+            )
         if not asked.any() and self.alone and self.settings.heated:
             heated = self._better_may_be_left(stage)
             asked |= heated
@@ -169,14 +181,16 @@ class Decisions:
         """Whether an attempt with noise at a single problem may bring a better optimum.
 
         After the first attempt, if its places have converged to optima of different costs: there
-        are several basins. Later, if the latest attempt came to the best one, and only once.
+        are several basins. Later, if the latest attempt came to the best one, as the first to do
+        so, and only once.
         """
         kept, now, scale, floor = stage.kept, stage.now, stage.cost_scale[0], stage.floor[0]
         assert kept is not None
         best = kept.sound_cost - floor
         bar = done_up_to(best, np.asarray(kept.info.size), CHEAPER, scale)
         if stage.attempt > 0:
-            return bool((stage.ends[int(stage.heated)] - floor <= bar).sum() == 1)
+            came = stage.ends[int(stage.heated)] - floor <= bar
+            return bool(came.sum() == came[-len(now.missed) :].sum() == 1)
         if self.polish is None:
             return False
         optimal, alive = on_host((now.state.polish.optimal, now.state.alive), self.mesh)
@@ -200,12 +214,17 @@ class Decisions:
         return np.where(feasible & ~(missed & arrives), costs, np.inf)
 
     def done_up_to(
-        self, stage: Stage, indices: np.ndarray, now: Chains | None = None
+        self,
+        stage: Stage,
+        indices: np.ndarray,
+        now: Chains | None = None,
+        within: float | None = None,
     ) -> np.ndarray:
         """Up to which cost, from their floors, chains of those problems are done, (n, 1).
 
         By what is kept, and by the rows of the chunk `now`. Where cheaper plans miss the goal, what
-        reaches it may be far from its best, so no chain is done.
+        reaches it may be far from its best, so no chain is done. The share is that of the settings,
+        or `within`.
         """
         kept, n = stage.kept, len(indices)
         costs, sizes = [stage.least[indices, None]], [np.full((n, 1), np.nan)]
@@ -215,9 +234,10 @@ class Decisions:
         if now is not None:
             costs.append(self._costs_to_beat(now, n) - stage.floor[indices, None])
             sizes.append(np.asarray(now.info.size).reshape(n, -1))
-        assert self.settings.within is not None
+        share = self.settings.within if within is None else within
+        assert share is not None
         both = np.concatenate(costs, axis=1), np.concatenate(sizes, axis=1)
-        return done_up_to(*both, self.settings.within, stage.cost_scale[indices])
+        return done_up_to(*both, share, stage.cost_scale[indices])
 
     def owners(self, stage: Stage, indices: np.ndarray, now: Chains) -> np.ndarray:
         """Which of its problem's chains gets what each place of the chunk has found, (n, places).
@@ -229,5 +249,26 @@ class Decisions:
             owners = np.full_like(order, -1)
             owners[0, np.sort(order[0, : self.chains])] = np.arange(self.chains)
             return owners
-        cost, bar = self.sound_costs(stage, kept, indices), self.done_up_to(stage, indices, now)
-        return owners_of_places((cost <= bar) & (self.done_share <= 1.0), cost, order)
+        done = self._are_done(stage, indices, now, kept)
+        return owners_of_places(done, self.sound_costs(stage, kept, indices), order)
+
+    def _are_done(self, stage: Stage, indices: np.ndarray, now: Chains, kept: Chains) -> np.ndarray:
+        """Which kept chains of those problems are, now that this was found, (n, chains)."""
+        bar = self.done_up_to(stage, indices, now)
+        return (self.sound_costs(stage, kept, indices) <= bar) & (self.done_share <= 1.0)
+
+    def not_for_done_chains(self, stage: Stage, now: Chains, owners: np.ndarray) -> Chains:
+        """What a single problem's places have found; chains that are done take none that moves.
+
+        A plan that is not settled may be cheap because it uses the tolerance of the dynamics.
+
+        Args:
+            stage: what is kept.
+            now: the places.
+            owners: which chain gets what each has found, (places,).
+        """
+        if not self.ends_early:
+            return now
+        assert stage.kept is not None
+        done = self._are_done(stage, np.zeros(1, int), now, stage.kept)[0]
+        return replace(now, missed=now.missed | (self.moving(now.state) & done[owners]))

@@ -262,7 +262,7 @@ class Search:
             before=now.sound_cost,
             damping=np.ones(rows),
             step=0,
-            ends=(np.full(1, np.inf),) * 2,
+            ends=(np.zeros(0),) * 2,
             work=np.ones(2, int),
             rollouts=0,
             records=((0, self._best(now)),),
@@ -401,8 +401,8 @@ class Search:
         ends, work = list(stage.ends), stage.work.copy()
         if self.family.alone:
             kind = int(stage.heated)
-            ends[kind] = stage.now.sound_cost
-            work[kind] = max(stage.step, 1) * len(ends[kind])
+            ends[kind] = np.append(ends[kind], stage.now.sound_cost)
+            work[kind] += stage.step * len(stage.now.missed)
         place = min(stage.place + self.width, len(stage.todo))
         self.stage = replace(
             stage, kept=kept, ends=(ends[0], ends[1]), work=work, place=place, begun=False
@@ -476,6 +476,7 @@ class Search:
         if kept is None:
             return now if owners.size == self.chains else now.at(np.flatnonzero(owners >= 0))
         if self.family.alone:
+            now = self.decisions.not_for_done_chains(stage, now, owners.ravel())
             return best_of(kept, now, owners.ravel())
         fresh = min(self.width, len(stage.todo) - stage.place)
         of_problem = np.arange(self.chains)

@@ -62,10 +62,13 @@ def test_all_active_places_are_waited_for_unless_another_attempt_will_be_made():
     np.testing.assert_array_equal(may.waited_for, active)
 
 
-def test_an_attempt_that_only_looks_for_better_optima_ends_when_nothing_may_be_one():
-    at = so_far([0.9, 0.95, 7.0, INF], [False, True, True, True], wanted=1, needless=1.0)
+def test_an_attempt_that_only_looks_for_better_optima_ends_when_few_may_be_one():
+    cost, active = [0.9, 0.95, 7.0, INF], [False, True, True, True]
+    at = so_far(cost, active, wanted=1, needless=1.0)
     assert not at.over
     np.testing.assert_array_equal(at.waited_for, [False, True, False, True])
+    # after two that have settled, half a one of the two that move is expected to be better
+    assert so_far([*cost, 0.9], [*active, False], wanted=1, needless=1.0).over
 
 
 def test_half_of_the_places_must_agree_in_the_first_attempt():
