@@ -81,6 +81,8 @@ def inverse_dynamics(
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
     model.actuator_forcelimited[:] = 0
+    model.tendon_actfrclimited[:] = 0
+    by_actuators = model.jnt_actgravcomp[model.dof_jntid]
     data = mujoco.MjData(model)
     out = np.broadcast_to(rest, (len(x) - 1, model.nu)).copy()
     nq, nv, steps = model.nq, model.nv, np.broadcast_to(dt, len(out))
@@ -92,7 +94,8 @@ def inverse_dynamics(
         data.qacc[:] = (x[k + 1, nq : nq + nv] - x[k, nq : nq + nv]) / steps[k]
         mujoco.mj_inverse(model, data)
         moment = moment_arms(model, data)
-        A, b = moment.T * (above - at_rest), data.qfrc_inverse - moment.T @ at_rest
+        wanted = data.qfrc_inverse - by_actuators * data.qfrc_gravcomp  # which comes by itself
+        A, b = moment.T * (above - at_rest), wanted - moment.T @ at_rest
         if np.isfinite(A).all() and np.isfinite(b).all():
             out[k] = u + np.linalg.lstsq(A, b, rcond=None)[0]
     return out

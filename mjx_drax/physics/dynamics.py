@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.tree_util import Partial
+from jax.typing import ArrayLike
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.pytrees import HostOnly
@@ -28,7 +29,7 @@ from mjx_drax.kernels.scalars.scalarize import scalarized
 from mjx_drax.physics import step as one_step
 from mjx_drax.physics._mjx import mjx
 from mjx_drax.physics.c_engine.model_numbers import set_numbers
-from mjx_drax.physics.c_engine.states import differences, integrate, set_state
+from mjx_drax.physics.c_engine.states import converged, differences, integrate, set_state
 from mjx_drax.physics.c_engine.stepper import Spare, Stepper
 from mjx_drax.physics.contacts.collision import left_out
 from mjx_drax.physics.contacts.pairs import Contacts, contact_pairs, geom_name
@@ -40,6 +41,7 @@ from mjx_drax.physics.mjx_model import (
     has_constraints,
     kept_contacts,
     put_model,
+    with_subtree_masses,
 )
 from mjx_drax.physics.observed import Observed
 from mjx_drax.physics.saturation import Ends, finite_ends, unlimited, useful_controls
@@ -237,6 +239,8 @@ class MjxDynamics(Dynamics):
             model = model.replace(opt=model.opt.replace(timestep=knot.dt / self.substeps))
         if self.numbers is not None:
             model = model.replace(**self.numbers(model, knot.parameters))
+            if "body_mass" in self.free:
+                model = with_subtree_masses(model)
         object.__setattr__(new, "time", knot.time)
         object.__setattr__(new, "model", model)
         return new
@@ -249,8 +253,7 @@ class MjxDynamics(Dynamics):
 
     def observe(self, x: Array, u: Array) -> Observed:
         """`mjx.Data` at the knot, all computed: what a cost does not read costs nothing."""
-        data, readings = _observe(self.model, self.structure, x, u)
-        data = data if self.time is None else data.replace(time=self.time)
+        data, readings = _observe(self.model, self.structure, x, u, self.time)
         return Observed.of(self.model, data, readings)
 
     @property
@@ -447,13 +450,14 @@ class MjxDynamics(Dynamics):
 
     def observer(self) -> Callable[[np.ndarray, float], mujoco.MjData]:
         """`observe_replayed` for many states, in one MjData, which takes long to make."""
-        data = mujoco.MjData(self.mj_model)
+        model = converged(self.mj_model)
+        data = mujoco.MjData(model)
 
         def observe(x: np.ndarray, time: float) -> mujoco.MjData:
-            mujoco.mj_resetData(self.mj_model, data)
+            mujoco.mj_resetData(model, data)
             data.time = time
-            set_state(self.mj_model, data, x)
-            mujoco.mj_forward(self.mj_model, data)
+            set_state(model, data, x)
+            mujoco.mj_forward(model, data)
             return data
 
         return observe
@@ -523,9 +527,9 @@ def mjx_dynamics(dynamics: Dynamics) -> MjxDynamics | None:
 
 
 def _observe(
-    model: mjx.Model, structure: Structure, x: Array, u: Array
+    model: mjx.Model, structure: Structure, x: Array, u: Array, time: ArrayLike | None
 ) -> tuple[mjx.Data, tuple[Array, ...]]:
-    return one_step.forward(structure.fixed_in(model), x, u)
+    return one_step.forward(structure.fixed_in(model), x, u, time)
 
 
 def _step(model: mjx.Model, structure: Structure, substeps: int, x: Array, u: Array) -> Array:

@@ -238,13 +238,26 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
     except Exception as error:
         raise DraxError(f"model_numbers failed: {plain(error)}. Return {give}.") from error
     for field, value in found.items():
-        own = getattr(dynamics.model, field, None)
-        if own is None or not hasattr(dynamics.mj_model, field) or own.shape != value.shape:
-            shape = "no such field" if own is None else f"shape {own.shape}"
+        wanted, shape = (
+            getattr(numbers, "shape", None)
+            for numbers in (getattr(dynamics.model, field, None), value)
+        )
+        if wanted is None or shape != wanted or not hasattr(dynamics.mj_model, field):
+            has = "no such field" if wanted is None else f"shape {wanted}"
             raise DraxError(
-                f"model_numbers returned {field!r} of shape {value.shape}, and the model has "
-                f"{shape}: return {give}."
+                f"model_numbers returned {field!r} of shape {shape}, and the model has {has}: "
+                f"return {give}."
             )
+    ends, bounded = (
+        {"jnt_range", "jnt_margin"} & set(found),
+        dynamics.mj_model.jnt_limited.astype(bool),
+    )
+    if ends and (bounded & (np.asarray(dynamics.model.jnt_limited) == 0)).any():
+        raise DraxError(
+            f"model_numbers returned {min(ends)!r}, but the ranges of joints that are driven are "
+            "bounds of the plan: give the model wide ranges, and an inequality that reads "
+            "knot.parameters."
+        )
     for parameters in tried:
         set_numbers(copy.copy(dynamics.mj_model), numbers(dynamics.model, parameters))
     return list(found)

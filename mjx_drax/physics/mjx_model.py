@@ -14,13 +14,21 @@ import re
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_drax.base.errors import DraxError, shown
-from mjx_drax.physics._mjx import COLLISIONS, geom_pairs, internal, mjx
+from mjx_drax.kernels.linalg import product
+from mjx_drax.physics._mjx import COLLISIONS, internal, mjx
 from mjx_drax.physics.actuators import disabled, driven
 from mjx_drax.physics.contacts.collision import extended, make_data, signature
-from mjx_drax.physics.contacts.pairs import Contacts, Pair, geom_name, left_out
+from mjx_drax.physics.contacts.pairs import (
+    Contacts,
+    Pair,
+    geom_name,
+    left_out,
+    numbered_pairs,
+)
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.physics.joints import HINGE, SLIDE
 
@@ -147,6 +155,8 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
     opt.solver = int(mujoco.mjtSolver.mjSOL_NEWTON)  # all solvers find the same minimum
     if opt.integrator in IMPLICIT:
         opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    if opt.density == 0.0 and opt.viscosity == 0.0:
+        opt.wind[:] = 0.0  # of which MuJoCo takes no notice then, and MJX does
     opt.enableflags &= ~int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_SLEEP)
     springs, dampers = int(_DISABLE.mjDSBL_SPRING), int(_DISABLE.mjDSBL_DAMPER)
     if opt.disableflags & springs:
@@ -178,9 +188,18 @@ def _make_supported(model: mujoco.MjModel, without: set[Pair]) -> None:
         model.sensor_type[touch] = int(mujoco.mjtSensor.mjSENS_CLOCK)  # 0 in every state, too
     model.actuator_gainprm[disabled(model)] = 0.0
     model.actuator_biasprm[disabled(model)] = 0.0
+    model.actuator_dyntype[disabled(model)] = int(mujoco.mjtDyn.mjDYN_NONE)  # states stay
     unknown = unknown_sensors(model)
     model.sensor_type[unknown] = int(mujoco.mjtSensor.mjSENS_CLOCK)
     model.sensor_intprm[unknown, 0] = NOT_COMPUTED  # clocks have none
+
+
+def with_subtree_masses(model: mjx.Model) -> mjx.Model:
+    """The model with the masses of subtrees that follow from those of its bodies."""
+    below = np.eye(model.nbody)
+    for body in range(model.nbody - 1, 0, -1):
+        below[model.body_parentid[body]] += below[body]
+    return model.replace(body_subtreemass=product(jnp.asarray(below), model.body_mass))
 
 
 def held_dofs(model: mujoco.MjModel) -> np.ndarray:
@@ -197,13 +216,18 @@ def hold_by_inertia(model: mujoco.MjModel) -> None:
 
 def _pairs(model: mujoco.MjModel, without: set[Pair]) -> list[tuple[int, int, int]]:
     """Pairs of geoms that a plan has contacts of, each with the number of its <pair>, or -1."""
-    return [(int(a), int(b), int(i)) for a, b, i in geom_pairs(model) if (a, b) not in without]
+    return [pair for pair in numbered_pairs(model) if pair[:2] not in without]
+
+
+_UNSEEN = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_HFIELD, _GEOM.mjGEOM_SDF)
+"""Geoms that rays of MJX pass through."""
 
 
 def unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
     """Sensors that MJX does not compute, or not as the C engine does, (nsensor,).
 
-    Those that read late are among them, and lists of contacts (reduce="none"), whose order differs.
+    Those that read late are among them, lists of contacts (reduce="none"), whose order differs,
+    rays where there are geoms that they pass through, and forces beside spatial tendons.
     """
     unknown = np.array([int(kind) not in _SENSORS for kind in model.sensor_type], bool)
     unknown |= (model.sensor_delay > 0) | (model.sensor_interval[:, 0] > 0)
@@ -215,6 +239,12 @@ def unknown_sensors(model: mujoco.MjModel) -> np.ndarray:
     touch = np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_TOUCH))
     cylinders = model.site_type[model.sensor_objid[touch]] == int(mujoco.mjtGeom.mjGEOM_CYLINDER)
     unknown[touch[cylinders]] = True
+    of = mujoco.mjtSensor
+    if (model.wrap_type[model.tendon_adr] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+        # what a spatial tendon pulls with is missing in MJX's forces between bodies
+        unknown |= np.isin(model.sensor_type, [int(of.mjSENS_FORCE), int(of.mjSENS_TORQUE)])
+    if np.isin(model.geom_type, [int(kind) for kind in _UNSEEN]).any():
+        unknown |= model.sensor_type == int(of.mjSENS_RANGEFINDER)
     return unknown
 
 

@@ -5,7 +5,7 @@
 A function of these works in a cost and in a goal alike, because names and shapes are MuJoCo's: a
 matrix is (9,), and what a joint, a sensor or an actuator has is a vector, also where it is one
 number. An element may also be given by its number. In `data.sensordata` what MJX does not compute
-is NaN.
+is NaN, and so is `data.qfrc_fluid`.
 """
 
 from dataclasses import dataclass, fields
@@ -36,6 +36,17 @@ _OWN = {
 }
 """The arrays of `mjx.Data` that hold something of each kind of element. Left out are those that
 MuJoCo computes only for sensors, and those that hold something else in a step of this package."""
+
+_ELSEWHERE = {
+    "subtree_linvel": "a sensor subtreelinvel",
+    "subtree_angmom": "a sensor subtreeangmom",
+    "cacc": "a sensor accelerometer or framelinacc",
+    "cfrc_int": "a sensor force or torque",
+    "cfrc_ext": "a sensor touch or contact",
+    "contact": "a sensor touch or contact",
+    "ncon": "a sensor touch or contact",
+}
+"""Arrays that MJX leaves 0, or fills as MuJoCo does not, and what has such numbers instead."""
 
 _PREFIXES = ("geom_", "site_", "cam_", "actuator_", "ten_", "sensor")
 _NAME_ADDRESSES = {"joint": "jnt", "camera": "cam"}
@@ -174,11 +185,22 @@ class Observed(mjx.Data):
     def of(cls, model: mjx.Model, data: mjx.Data, readings: tuple[Array, ...]) -> "Observed":
         """The data with the names of its model."""
         arrays = {field.name: getattr(data, field.name) for field in fields(data)}
+        arrays["qfrc_passive"] = arrays["qfrc_passive"] + arrays["qfrc_applied"]  # see `step`
+        arrays["qfrc_applied"] = jnp.zeros_like(arrays["qfrc_applied"])
+        arrays["qfrc_fluid"] = jnp.full_like(arrays["qfrc_fluid"], jnp.nan)
         names = Names.in_model(model)
         for i in names.unknown:  # to MJX they are 0
             entries = slice(*names.sensors[i])
             arrays["sensordata"] = arrays["sensordata"].at[entries].set(jnp.nan)
         return cls(**arrays, names=names, readings=readings)
+
+    def __getattr__(self, name: str) -> Any:
+        """What MJX keeps in a part of its own."""
+        if name.startswith("_"):  # before there is any, as when it is copied
+            raise AttributeError(name)
+        if name in _ELSEWHERE:
+            raise DraxError(f"data.{name} is not computed in a plan: use {_ELSEWHERE[name]}.")
+        return getattr(internal(self), name)
 
     def body(self, name: str | int) -> Element:
         """A body: xpos (3,), xquat (4,), xmat (9,), xipos, ximat, cvel (6,), subtree_com (3,)."""

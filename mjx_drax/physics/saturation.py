@@ -91,7 +91,11 @@ def ends_of(model: mjx.Model, time: float = 0.0) -> Ends | None:
     single &= np.asarray(model.actuator_gaintype) == _FIXED
     single &= np.isin(model.actuator_biastype, _LINEAR)
     own = np.asarray(model.actuator_forcelimited).astype(bool)
-    of_joint = np.asarray(model.jnt_actfrclimited).astype(bool)[joint] if model.njnt else own
+    # Where actuators compensate gravity, the range of the joint is not theirs alone
+    theirs = np.asarray(model.jnt_actfrclimited).astype(bool) & ~np.asarray(
+        model.jnt_actgravcomp
+    ).astype(bool)
+    of_joint = theirs[joint] if model.njnt else own
     (which,) = np.nonzero(single & (own | of_joint))
     if not which.size:
         return None

@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
+from jax.typing import ArrayLike
 
 from mjx_drax.kernels.constraint_solver import (
     Constraints,
@@ -77,14 +78,17 @@ def data_at(model: mjx.Model, x: Array, u: Array) -> mjx.Data:
     return make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=u)
 
 
-def forward(model: mjx.Model, x: Array, u: Array) -> tuple[mjx.Data, tuple[Array, ...]]:
+def forward(
+    model: mjx.Model, x: Array, u: Array, time: ArrayLike | None = None
+) -> tuple[mjx.Data, tuple[Array, ...]]:
     """`mjx.forward`: all that follows from a state (nx,) and a control (nu,), up to accelerations.
 
     Also `sensordata` with the sensors of each of `kinds_of_sensors` alone: one array of all would
     make compiled functions, which compute only what their caller reads, compute all of them.
     """
-    data = _constrained(model, _smooth(model, kinematics(model, data_at(model, x, u))))
-    return with_sensors(model, data)
+    data = data_at(model, x, u)
+    data = data if time is None else data.replace(time=time)
+    return with_sensors(model, _constrained(model, _smooth(model, kinematics(model, data))))
 
 
 def with_sensors(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, tuple[Array, ...]]:

@@ -71,7 +71,7 @@ def lines(solution: Results) -> list[str]:
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     hints = (_fall(solution), _off_the_engine(solution)) if solution.certified else ()
-    between = _between_knots(solution) if solution.certified else ""
+    between = [_between_knots(solution), _unplanned_contact(solution)] if solution.certified else []
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -80,7 +80,7 @@ def lines(solution: Results) -> list[str]:
         f"{solution.max_defect[best]:.1e}",
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
-        *([f"               {between}"] if between else []),
+        *(f"               {said}" for said in between if said),
         f"optimality     {solution.optimality}",
         *(f"               {hint}" for hint in hints if hint),
         *optima_lines(solution),
@@ -210,6 +210,22 @@ def _between_knots(solution: Results) -> str:
         f"between knots {knot} and {knot + 1}, after {solution.times[knot]:.3g} s, inequality "
         f"[{broken.entry}] is broken by {broken.size:.1e} (tolerated: {broken.allowed:.1e}): plans "
         "keep constraints at knots alone. Give a smaller dt, or keep more distance"
+    )
+
+
+def _unplanned_contact(solution: Results) -> str:
+    """What there is to say where a replay has a contact that constraints do not see."""
+    problem = solution.problem
+    if problem.constraint.rows + problem.terminal_constraint.rows == 0:
+        return ""
+    found = problem.dynamics.left_out(solution.replayed[0])
+    if found is None:
+        return ""
+    knot, contact = found
+    return (
+        f"when replayed {contact} at knot {knot}, {solution.times[knot]:.2f} s: the plan has no "
+        "contacts of these two, and constraints that read contact forces do not see them. Add the "
+        "pair to contacts= if any does"
     )
 
 

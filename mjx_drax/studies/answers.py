@@ -45,7 +45,7 @@ def line(solution: Solution) -> str:
     costs = solution.replay_cost[good]
     best = solution.replay_cost[solution.best_chain]
     median = np.median(costs) if good.any() else np.inf
-    close = (costs <= 1.01 * best).sum() / solution.chains
+    close = (costs <= best + 0.01 * abs(best)).sum() / solution.chains
     converged = solution.residual < solution.tolerance
     return (
         f"| {solution.problem.name} | {solution.chains:,} | {solution.seed} | {good.mean():.2%} "

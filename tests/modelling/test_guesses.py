@@ -125,6 +125,17 @@ def test_controls_are_those_that_drive_the_engine_along_the_path():
     close(guess.u[1:], applied[1:], 0.05)
 
 
+@pytest.mark.parametrize("by_actuators", ["true", "false"])
+def test_an_arm_whose_weight_is_compensated_is_held_by_nothing(by_actuators):
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><body gravcomp="1">
+        <joint name="j" axis="0 1 0" actuatorgravcomp="{by_actuators}"/>
+        <geom size="0.1" pos="0.5 0 0" mass="2"/></body></worldbody>
+        <actuator><motor joint="j"/></actuator></mujoco>"""
+    )
+    close(inverse_dynamics(model, np.zeros((2, 2)), 0.01, np.zeros(1)), 0.0, 1e-9)
+
+
 def test_controls_without_an_answer_are_the_middle_of_their_bounds():
     stateful = (
         '<general joint="lift" dyntype="filter" dynprm="0.1" ctrlrange="-1 3" ctrllimited="true"/>'

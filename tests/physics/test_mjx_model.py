@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco.mjx._src import collision_driver
 
 from mjx_drax import DraxError, from_mjcf
 from mjx_drax.base.errors import DraxWarning
@@ -16,6 +17,7 @@ from mjx_drax.physics.agreement.checks import Samples, compare, examine
 from mjx_drax.physics.agreement.differences import differences, set_aside
 from mjx_drax.physics.c_engine.states import Engine, integrate
 from mjx_drax.physics.c_engine.stepper import Stepper
+from mjx_drax.physics.contacts.collision import extended
 from mjx_drax.physics.contacts.pairs import contact_pairs
 from mjx_drax.physics.mjx_model import (
     MOST_CONTACTS,
@@ -80,9 +82,9 @@ STATES = Samples(
             "flag": 'contact="disable" energy="enable" fwdinv="enable" spring="disable"',
         },
         {"option": 'solver="CG"', "flag": 'contact="disable" damper="disable"'},
-        {"flag": 'contact="disable" spring="disable" damper="disable"'},
+        {"flag": 'contact="disable" spring="disable" damper="disable"', "option": 'wind="9 0 0"'},
     ],
-    ids=["PGS, energy, groups, springs", "CG, dampers", "springs and dampers"],
+    ids=["PGS, energy, groups, springs", "CG, dampers", "springs and dampers, wind in no air"],
 )
 def test_what_is_made_supported_steps_like_the_c_engine(parts):
     model = rigid(**parts)
@@ -417,6 +419,7 @@ def test_several_connects_and_welds_pull_as_in_the_c_engine(option, active):
         ({"actuator": '<general joint="two" dyntype="filter" actearly="true"/>'}, "actearly"),
         ({"motor": 'delay="0.02" nsample="4"'}, "delays"),
         ({"motor": 'armature="0.1"'}, "own damping and armature"),
+        ({"joint": 'range="-5 5" margin="0.1"'}, "its margin of both ends of its range"),
         ({"option": 'density="1"', "links": 'fluidshape="ellipsoid"'}, "ellipsoid fluid"),
         ({"floor": "cylinder"}, "contacts like that of 'link' with 'floor'"),
         (
@@ -462,6 +465,31 @@ def test_a_plain_model_has_no_differences():
 
 def names(model):
     return {frozenset(model.geom(g).name for g in pair) for pair in contact_pairs(model)}
+
+
+@pytest.mark.slow
+def test_states_of_actuators_that_are_off_stay():
+    filtered = '<general joint="two" dyntype="filter" dynprm="0.1" group="1"/>'
+    model = rigid(option='actuatorgroupdisable="1"', actuator=filtered)
+    x, u = np.array([0.3, -0.2, 1.0, -0.5, 0.4]), np.array([0.5, 1.0, 2.0])
+    with jax.enable_x64(True):
+        reached = jax.jit(step)(put_model(model), jnp.asarray(x), jnp.asarray(u))
+    np.testing.assert_allclose(reached, Engine(model).step(x, u), atol=1e-10)
+    assert float(reached[-1]) == 0.4
+
+
+def test_mocap_bodies_touch_nothing_of_the_world():
+    marker = (
+        '<worldbody><body name="m" mocap="true"><geom name="mark" size="1"/></body></worldbody>'
+    )
+    found = names(chain(more=marker))
+    assert frozenset({"mark", "floor"}) not in found
+    assert frozenset({"mark", "link"}) in found
+    forced = marker + '<contact><pair geom1="floor" geom2="mark"/></contact>'
+    assert frozenset({"mark", "floor"}) in names(chain(more=forced))
+    with extended():
+        here = {frozenset(pair[:2]) for pair in collision_driver.geom_pairs(chain(more=marker))}
+    assert here == {frozenset(pair) for pair in contact_pairs(chain(more=marker))}
 
 
 def test_contact_pairs_are_those_of_mujoco():

@@ -10,6 +10,9 @@ import pytest
 
 from mjx_drax import DraxError, Terms, from_mjcf
 from mjx_drax.kernels.pruning import needed_program
+from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.physics.mjx_model import unknown_sensors
+from mjx_drax.problem.trajectory import Knot
 
 MODEL = """
 <mujoco model="toy"><option timestep="0.01"><flag contact="disable"/></option>
@@ -109,11 +112,66 @@ def test_knots_in_a_batch_are_read_along_the_last_axes():
         (lambda d: d.camera(3).xpos, "no camera 3: there is 'eye'"),
         (lambda d: d.body(None).xpos, "no body None: there is 'world', 'base', 'arm', 'hand'"),
         (lambda d: d.geom("palm").xquat, "a geom has no 'xquat': it has xpos, xmat"),
+        (lambda d: d.subtree_linvel, "not computed in a plan: use a sensor subtreelinvel"),
+        (lambda d: d.contact.dist, "data.contact is not computed in a plan: use a sensor touch"),
     ],
 )
 def test_wrong_names_list_those_that_there_are(read, words):
     with pytest.raises(DraxError, match=re.escape(words)):
         toy(terminal_residual=read)
+
+
+SENSED = """<mujoco><option timestep="0.01"/><worldbody><site name="w" pos="0 0 1"/>{geom}
+  <body name="a"><joint name="j" axis="0 1 0" stiffness="3"/><geom size="0.1" pos="0.2 0 0"/>
+    <site name="s"/><body name="b" pos="0.5 0 0"><joint type="ball" stiffness="2"/>
+      <geom size="0.1" mass="2"/></body></body></worldbody>
+  <tendon>{tendon}</tendon><actuator><motor joint="j"/></actuator>
+  <sensor><clock name="clock"/><force name="force" site="s"/><rangefinder name="ray" site="s"/>
+    <subtreelinvel name="speed" body="a"/></sensor></mujoco>"""
+SPATIAL = '<spatial name="t" stiffness="3"><site site="w"/><site site="s"/></spatial>'
+FIXED = '<fixed name="t" stiffness="3"><joint joint="j" coef="1"/></fixed>'
+
+
+@pytest.mark.parametrize(
+    ("tendon", "geom", "unknown"),
+    [
+        (FIXED, "", []),
+        (SPATIAL, "", ["force"]),
+        (FIXED, '<geom type="cylinder" size="0.1 0.1" pos="0 9 0"/>', ["ray"]),
+    ],
+)
+def test_sensors_that_mjx_computes_otherwise_are_unknown(tendon, geom, unknown):
+    model = mujoco.MjModel.from_xml_string(SENSED.format(tendon=tendon, geom=geom))
+    found = [model.sensor(int(i)).name for i in np.flatnonzero(unknown_sensors(model))]
+    assert found == unknown
+
+
+@pytest.mark.slow
+def test_clocks_passive_forces_and_speeds_of_other_masses_are_those_of_the_c_engine():
+    xml = SENSED.format(tendon=FIXED, geom="")
+    problem = from_mjcf(
+        xml,
+        horizon=0.02,
+        terminal_residual=lambda data: data.qvel,
+        parameters={"mass": (1.0, 9.0)},
+        model_numbers=lambda model, p: {"body_mass": model.body_mass.at[2].set(p["mass"])},
+    )
+    of_body, own = problem.dynamics, mujoco.MjModel.from_xml_string(xml)
+    x = np.zeros(of_body.nx)
+    x[:5], x[5:9] = [0.3, 0.8, 0.6, 0.0, 0.0], [1.0, 2.0, 3.0, 4.0]
+    x[-1] = 5.0  # the mass
+    knot = Knot(0.5, 0, 0.01, None, jnp.asarray(x), {"mass": jnp.asarray(5.0)})
+    inner = mjx_dynamics(of_body).at(knot)
+    seen = jax.jit(inner.observe)(jnp.asarray(x[:9], jnp.float32), jnp.zeros(1))
+    own.body_mass[2] = 5.0
+    data = mujoco.MjData(own)
+    mujoco.mj_setConst(own, data)
+    data.qpos[:], data.qvel[:], data.time = x[:5], x[5:9], 0.5
+    mujoco.mj_forward(own, data)
+    np.testing.assert_allclose(seen.sensor("clock").data, 0.5)
+    np.testing.assert_allclose(seen.sensor("speed").data, data.sensor("speed").data, atol=1e-4)
+    np.testing.assert_allclose(seen.qfrc_passive, data.qfrc_passive, atol=1e-4)
+    np.testing.assert_allclose(seen.qfrc_applied, 0.0)
 
 
 @pytest.mark.parametrize("read", ["by name", "as a term"])

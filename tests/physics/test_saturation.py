@@ -74,6 +74,8 @@ def test_no_ends_where_forces_have_no_ranges_or_contacts_act():
     assert not unlimited.saturates
     dry = planned(arm(SERVO.format(1), 'frictionloss="0.1"'))
     assert dry.dynamics.useful_controls(dry.x_init[None]) is None
+    lifts = arm(HELD + MOTOR, f'{RANGE} actuatorgravcomp="true"')  # they lift beside it
+    assert np.isinf(planned(lifts).dynamics.useful_controls(np.zeros((1, 4)))[0][0, 0])
     only_motor = planned(arm(MOTOR.replace("-9 9", "-1 1")))
     assert not only_motor.saturates  # its controls end before its forces do
     free = planned(arm(SERVO.format(1) + HELD.replace('"one"', '"two"')))

@@ -550,6 +550,14 @@ def test_bad_choices_are_named(changes, message):
         (lambda model, p: {"mass": p["m"]}, "no such field"),
         (lambda model, p: {"body_mass": p["m"]}, r"the model has shape"),
         (lambda model, p: p["n"], "model_numbers failed"),
+        (
+            lambda model, p: {"opt": model.opt},
+            "'opt' of shape None, and the model has no such field",
+        ),
+        (
+            lambda model, p: {"jnt_range": model.jnt_range * p["m"]},
+            "'jnt_range', but the ranges of joints that are driven are bounds of the plan",
+        ),
     ],
 )
 def test_bad_numbers_of_a_model_are_named(numbers, message):

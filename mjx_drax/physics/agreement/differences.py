@@ -120,6 +120,12 @@ def differences(
             setting("geom_fluid", 0.0),
         ),
         (
+            model.jnt_limited * (2 * model.jnt_margin > np.ptp(model.jnt_range, axis=1)),
+            "where a joint is within its margin of both ends of its range, MJX has one limit act "
+            "and MuJoCo two: make the margin less than half of the range",
+            setting("jnt_margin", 0.0),
+        ),
+        (
             model.nplugin,
             "plugins are left out: remove them",
             setting("body_plugin geom_plugin actuator_plugin sensor_plugin", -1),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,20 @@ def of_hulls(model: mujoco.MjModel, pair: Sequence[int]) -> bool:
 def contact_pairs(model: mujoco.MjModel) -> Iterator[Pair]:
     """All pairs of geoms between which MuJoCo may make a contact; the lower type comes first."""
     if not model.opt.disableflags & (_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
-        yield from ((int(a), int(b)) for a, b, _ in geom_pairs(model))
+        yield from (pair[:2] for pair in numbered_pairs(model))
+
+
+def numbered_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
+    """All pairs that MJX looks at and MuJoCo too, each with the number of its <pair>, or -1."""
+    for a, b, i in geom_pairs(model):
+        if i >= 0 or not both_stay(model, a, b):
+            yield int(a), int(b), int(i)
+
+
+def both_stay(model: Any, a: int, b: int) -> bool:
+    """Whether no joint moves either geom: MuJoCo lets none of the world's touch a mocap body's."""
+    bodies = model.body_weldid[model.geom_bodyid[[a, b]]]
+    return not model.body_dofnum[bodies].any()
 
 
 def touching(model: mujoco.MjModel, contacts: Contacts) -> set[Pair]:

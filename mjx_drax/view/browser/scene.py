@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.base.files import require
-from mjx_drax.physics.c_engine.states import finite, set_state
+from mjx_drax.physics.c_engine.states import converged, finite, set_state
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.solution.replay import OPEN_LOOP
@@ -129,7 +129,8 @@ def contact_forces(
     The force is that on the second geom of the contact; on the first where the second is part of
     the world. The last state has the control of the one before.
     """
-    data, size = mujoco.MjData(model), model.nq + model.nv + model.na
+    model, size = converged(model), model.nq + model.nv + model.na
+    data = mujoco.MjData(model)
     found, force = [], np.empty(6)
     for k, state in enumerate(states[:, :size]):
         set_state(model, data, state)
