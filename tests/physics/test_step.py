@@ -159,10 +159,8 @@ def assert_steps_like_the_c_engine(model, states, **options):
             end, jacobian = map(np.asarray, expanded(x))
             off = difference(model, end, engine.step(x, control))
             np.testing.assert_allclose(off, 0, atol=1e-9, err_msg=name)
-            scale = np.abs(jacobian).max()
-            np.testing.assert_allclose(
-                jacobian / scale, engine.jacobian(x, control) / scale, atol=1e-6, err_msg=name
-            )
+            scale, exact = np.abs(jacobian).max(), engine.slopes(x, control).mean(axis=0)
+            np.testing.assert_allclose(jacobian / scale, exact / scale, atol=1e-6, err_msg=name)
 
 
 IMPLICIT = """

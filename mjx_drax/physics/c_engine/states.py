@@ -226,12 +226,8 @@ class Engine:
             mujoco.mj_forward(self.model, data)
         return data.contact
 
-    def jacobian(self, x: Floats, u: Floats, eps: float = 1e-6) -> Floats:
-        """[df/dx df/du] (ndx, ndx + nu) by central differences in tangent space."""
-        return self.slopes(x, u, eps).mean(axis=0)
-
     def slopes(self, x: Floats, u: Floats, eps: float = 1e-6) -> Floats:
-        """The same by differences to either side, (2, ndx, ndx + nu)."""
+        """[df/dx df/du] in tangent space by differences to either side, (2, ndx, ndx + nu)."""
         reached, ndx = self.step(x, u), 2 * self.model.nv + self.model.na
 
         def change(dz: Floats) -> Floats:

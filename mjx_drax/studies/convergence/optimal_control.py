@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjx_drax.physics.actuators import middle_control
 from mjx_drax.problem.build import from_function
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
@@ -57,11 +58,8 @@ def straight(problem: Problem, end: Sequence[float] | None = None) -> Trajectory
     goal = start if end is None else np.asarray(end, float)
     share = np.arange(1, K + 1)[:, None] / K
     x = jnp.asarray(start + share * (goal - start))
-    lower, upper = np.asarray(bounds.u_lower, float), np.asarray(bounds.u_upper, float)
-    both = np.isfinite(lower) & np.isfinite(upper)
-    with np.errstate(invalid="ignore"):
-        middle = np.where(both, 0.5 * (lower + upper), np.clip(0.0, lower, upper))
-    return problem.started(Trajectory(x, jnp.asarray(np.broadcast_to(middle, (K, nu)))))
+    u = np.broadcast_to(middle_control(bounds), (K, nu))
+    return problem.started(Trajectory(x, jnp.asarray(u)))
 
 
 def runge_kutta(rate: Rate, dt: Array | float) -> Rate:
