@@ -25,6 +25,9 @@ from mjx_drax.problem.trajectory import Box, Knot, Trajectory, box
 MOST = 1_000_000
 """Most knots of a horizon, and most numbers in a control; more is a mistake of units."""
 
+OFF_KNOT = 0.01
+"""Share of a step by which an event may be off its knot without a word."""
+
 
 def knots_in(horizon: Any, dt: float) -> int:
     """K = horizon / dt, rounded: the number of control knots in a horizon [s] at a step dt [s].
@@ -284,7 +287,7 @@ def assembled(
         for node in _checking_knots(None if function is None else as_partial(function)):
             node.check_knots(label, latest)
             if getattr(node, "once", False):
-                _warn_if_skipped(node, label, earliest)
+                (_warn_if_skipped if choices.phases else _warn_if_between)(node, label, earliest)
     if choices.phases:
         require_rows(data)
     free: tuple[tuple[int, ...], ...] = ()
@@ -334,6 +337,19 @@ def _checking_knots(part: Any) -> Iterator[Any]:
 
 def _checks_knots(node: Any) -> bool:
     return hasattr(node, "check_knots")
+
+
+def _warn_if_between(node: Any, label: str, times: np.ndarray) -> None:
+    """Warn where the time of an event is none of a knot."""
+    begin, step = float(node.begin), times[1] - times[0]
+    nearest = times[np.abs(times - begin).argmin()]
+    if abs(nearest - begin) > OFF_KNOT * step:
+        warnings.warn(
+            f"{label} is asked for at {begin:g} s, between two knots, and holds at the nearest, at "
+            f"{nearest:g} s. Choose a dt of which the time is a multiple.",
+            DraxWarning,
+            stacklevel=4,
+        )
 
 
 def _warn_if_skipped(node: Any, label: str, times: np.ndarray) -> None:

@@ -22,6 +22,7 @@ from mjx_drax import (
     solve,
     solve_batch,
 )
+from mjx_drax.base.errors import DraxWarning
 from mjx_drax.modelling.terms import Reference
 from mjx_drax.problem.trajectory import Knot
 from mjx_drax.search.family import Family
@@ -296,6 +297,11 @@ def test_waypoints_are_added():
     late = at_time(lambda x, u: x[:1], 9.0)
     with pytest.raises(DraxError, match="equality holds at 9 s, where it has no knot"):
         double_integrator(equality=FIRST + late, running_residual=FIRST)
+
+
+def test_a_waypoint_between_two_knots_is_told():
+    with pytest.warns(DraxWarning, match="is asked for at 0.93 s, .* at the nearest, at 0.9 s"):
+        double_integrator(equality=at_time(lambda x, u: x[:1], 0.93), running_residual=FIRST)
 
 
 @pytest.mark.slow
