@@ -196,10 +196,10 @@ class Observed(mjx.Data):
 
     def __getattr__(self, name: str) -> Any:
         """What MJX keeps in a part of its own."""
-        if name.startswith("_"):  # before there is any, as when it is copied
-            raise AttributeError(name)
         if name in _ELSEWHERE:
             raise DraxError(f"data.{name} is not computed in a plan: use {_ELSEWHERE[name]}.")
+        if name.startswith("_") or not hasattr(internal(self), name):
+            raise AttributeError(f"mjx.Data has no {name!r}.")
         return getattr(internal(self), name)
 
     def body(self, name: str | int) -> Element:

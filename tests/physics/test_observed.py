@@ -112,6 +112,7 @@ def test_knots_in_a_batch_are_read_along_the_last_axes():
         (lambda d: d.camera(3).xpos, "no camera 3: there is 'eye'"),
         (lambda d: d.body(None).xpos, "no body None: there is 'world', 'base', 'arm', 'hand'"),
         (lambda d: d.geom("palm").xquat, "a geom has no 'xquat': it has xpos, xmat"),
+        (lambda d: d.qpos_of_tip, "mjx.Data has no 'qpos_of_tip'"),
         (lambda d: d.subtree_linvel, "not computed in a plan: use a sensor subtreelinvel"),
         (lambda d: d.contact.dist, "data.contact is not computed in a plan: use a sensor touch"),
     ],
