@@ -79,8 +79,8 @@ from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem, checked
-from mjx_drax.problem.trajectory import Knot
-from mjx_drax.search.engine import Search
+from mjx_drax.problem.trajectory import Knot, Trajectory
+from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.restarts import Restarts, settled
@@ -189,7 +189,7 @@ class MPC:
         with problem.arithmetic():
             self.original, self.problem = problem, holding(problem, hold)
             look_again(self.problem)
-            self.solver = settled(self.problem, chains, seed, solver)
+            self.solver = true = settled(self.problem, chains, seed, solver)
             polish = self.solver.polish
             both = None  # with contacts, the polish that keeps forces in range takes too long
             if polish is not None and polish.iterations and not problem.dynamics.kinked:
@@ -197,6 +197,7 @@ class MPC:
             if both is not None:
                 self.problem, self.solver = both.first, without_rollouts(self.solver)
         self._held = None if both is None else both.held
+        self._true = None if both is None else (both.then, true)
         metric = self.solver.flow.preconditioner
         if not metric.has_gains:
             raise DraxError(
@@ -260,13 +261,9 @@ class MPC:
 
     def _reset(self, x: ArrayLike, t: float) -> Plan:
         look_again(self.problem)
-        problem = self.problem.with_x_init(self._inside(x)).at_time(t)
         self._begin(t)
         clock = time.perf_counter()
-        search = Search(Family.of_one(problem), self.chains, self.seed, self.solver)
-        found = search.run()
-        if found.interrupted:
-            raise KeyboardInterrupt
+        search, found = self._solved(self._inside(x), t)
         self._flow, self._floor = found.flow, float(search.stage.floor[0])
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
@@ -283,6 +280,33 @@ class MPC:
         self.first_solve = time.perf_counter() - clock
         self._start = self._taken(), self.latest
         return self.rewind(t)
+
+    def _solved(self, x: Array, t: float) -> tuple[Search, Found]:
+        """The first solve.
+
+        Where forces have no ends in plans, and nothing is found that keeps them in range, what is
+        found with the true forces is the guess of another one.
+        """
+
+        def search(
+            problem: Problem, solver: Restarts, guess: Trajectory | None = None
+        ) -> tuple[Search, Found]:
+            family = Family.of_one(problem.with_x_init(x).at_time(t))
+            one = Search(family, self.chains, self.seed, solver, guess=guess)
+            found = one.run()
+            if found.interrupted:
+                raise KeyboardInterrupt
+            return one, found
+
+        first = search(self.problem, self.solver)
+        if self._true is None or first[1].chains.sound.any():
+            return first
+        chains = search(*self._true)[1].chains
+        if not chains.sound.any():
+            return first
+        best = chains.order()[0, 0]
+        knots = jax.tree.map(lambda a: a[best], chains.state.trajectory)
+        return search(self.problem, self.solver, replace(knots, slack=None))
 
     def rewind(self, t: float = 0.0) -> Plan:
         """Go back to the plan that the last `reset` made, at time t [s], without solving again."""

@@ -32,6 +32,7 @@ from mjx_drax.control import trials as loop
 from mjx_drax.control.plant import random_pushes
 from mjx_drax.control.shift import shifted
 from mjx_drax.physics.c_engine.states import CONVERGED
+from mjx_drax.search.engine import Search
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import advance, start
 
@@ -145,9 +146,8 @@ def test_a_chain_that_is_alone_is_led_back_after_a_push():
     assert defects[1] < 0.2 * defects[0]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
-def test_servos_are_driven_up_to_where_their_forces_end_and_no_further(integrator):
+def servo(integrator="implicitfast"):
+    """A pendulum that a servo of little force brings to 1 rad."""
     text = f"""
     <mujoco><option timestep="0.01" integrator="{integrator}"/><worldbody><body>
       <joint name="one" axis="0 1 0" damping="0.3"/>
@@ -162,7 +162,13 @@ def test_servos_are_driven_up_to_where_their_forces_end_and_no_further(integrato
     def running(data, u):
         return jnp.concatenate([0.3 * data.qvel, 3.0 * (u - data.qpos)])
 
-    problem = from_mjcf(text, horizon=1.0, dt=0.02, running_residual=running, terminal_residual=off)
+    return from_mjcf(text, horizon=1.0, dt=0.02, running_residual=running, terminal_residual=off)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_servos_are_driven_up_to_where_their_forces_end_and_no_further(integrator):
+    problem = servo(integrator)
     policy, plant, forces = MPC(problem, chains=2, explorers=0, solver=FAST), Plant(problem), []
     policy.reset(plant.measured())
     while plant.time < 2.0:
@@ -173,6 +179,33 @@ def test_servos_are_driven_up_to_where_their_forces_end_and_no_further(integrato
     assert 5.9 < max(forces) < 6.0
     assert np.mean(np.array(policy.statistics.max_defects) < 1e-3) > 0.9
     np.testing.assert_allclose(plant.state, [1.0, 0.0], atol=0.05)
+
+
+@pytest.mark.slow
+def test_servos_start_from_a_plan_with_their_true_forces_where_none_else_is_found(monkeypatch):
+    """The first search, whose forces have no ends, is made to find nothing that counts."""
+    run, searches = Search.run, []
+
+    def spied(search):
+        found = run(search)
+        searches.append(search)
+        if len(searches) == 1:
+            missed = np.ones(len(found.chains.missed), bool)
+            found = replace(found, chains=replace(found.chains, missed=missed))
+        return found
+
+    monkeypatch.setattr(Search, "run", spied)
+    problem = servo()
+    policy = MPC(problem, chains=2, explorers=0, solver=FAST)
+    plan = policy.reset(problem.x_init)
+    free, true, again = searches
+    ranges = [float(s.family.problem.dynamics.model.actuator_forcerange[0, 1]) for s in searches]
+    assert ranges[1] == 6.0
+    assert ranges[0] == ranges[2] > 6.0
+    assert free.guess is true.guess is None
+    assert again.guess is not None
+    assert plan.max_defect < 1e-3
+    np.testing.assert_allclose(plan.x[-1], [1.0, 0.0], atol=0.05)
 
 
 @pytest.mark.slow
