@@ -38,7 +38,9 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -50,6 +52,7 @@ from jax.typing import ArrayLike
 
 from mjx_drax.base.errors import (
     DraxError,
+    DraxWarning,
     is_number,
     require_not_negative,
     require_whole,
@@ -75,6 +78,7 @@ from mjx_drax.control.planner import (
 )
 from mjx_drax.kernels.compilation import keep_programs, rarely_collected
 from mjx_drax.method.langevin import Langevin
+from mjx_drax.polish import interior_point
 from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.cost import Cost, as_partial, at_knot
 from mjx_drax.problem.extended import Extended
@@ -83,8 +87,10 @@ from mjx_drax.problem.trajectory import Knot, Trajectory
 from mjx_drax.search.engine import Found, Search
 from mjx_drax.search.family import Family
 from mjx_drax.search.identity import look_again
+from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.search.restarts import Restarts, settled
-from mjx_drax.search.unlimited import both_of, without_rollouts
+from mjx_drax.search.unlimited import both_of, found_in_steps, without_rollouts
+from mjx_drax.search.warm import Warm
 
 ENDLESS = 10**6
 """Iterations of the polish, of which none is the last one."""
@@ -117,12 +123,17 @@ class Statistics:
         took = [1e3 * seconds for seconds in self.latencies] or [math.nan]
         half, most = np.quantile(took, [0.5, 0.99])
         times = f"median {half:.2g} ms, 99 % within {most:.2g} ms"
-        return f"<Statistics of {self.plans} plans: {times}>"
+        return f"<Statistics of {self.plans} plans, {self.infeasible} infeasible: {times}>"
 
     @property
     def plans(self) -> int:
         """How many plans were made."""
         return len(self.latencies)
+
+    @property
+    def infeasible(self) -> int:
+        """How many plans broke the dynamics or a constraint, by max|h|."""
+        return int((np.array(self.max_defects) >= FEASIBLE).sum())
 
 
 class MPC:
@@ -191,9 +202,10 @@ class MPC:
             look_again(self.problem)
             self.solver = true = settled(self.problem, chains, seed, solver)
             polish = self.solver.polish
-            both = None  # with contacts, the polish that keeps forces in range takes too long
-            if polish is not None and polish.iterations and not problem.dynamics.kinked:
-                both = both_of(self.problem)
+            both = both_of(self.problem) if polish is not None and polish.iterations else None
+            # where f has kinks, a polish that keeps forces in range takes too long for plans
+            self._in_steps = both is not None and problem.dynamics.kinked
+            both = None if self._in_steps else both
             if both is not None:
                 self.problem, self.solver = both.first, without_rollouts(self.solver)
         self._held = None if both is None else both.held
@@ -263,12 +275,20 @@ class MPC:
         look_again(self.problem)
         self._begin(t)
         clock = time.perf_counter()
-        search, found = self._solved(self._inside(x), t)
-        self._flow, self._floor = found.flow, float(search.stage.floor[0])
+        solved, found, self._floor = self._solved(self._inside(x), t)
+        if not found.chains.feasible.any():
+            least = np.nanmin(found.chains.info.max_defect, initial=np.inf)
+            warnings.warn(
+                f"no plan of the first solve is feasible: the best has max|h| = {least:.1e}. Look "
+                "at what solve(problem) says, or give more chains or a longer horizon.",
+                DraxWarning,
+                stacklevel=3,
+            )
+        self._flow = found.flow
         self._heated = replace(
             self._flow, iterations=HEATED, tail=CYCLE - HEATED, noise=self.solver.flow.noise
         )
-        settings = self._flow, self._heated, self._polish, search.family.problem
+        settings = self._flow, self._heated, self._polish, solved
         leaves, structure = jax.tree.flatten(settings)
         self._settings = jax.device_put(leaves)
         carried = first_carried(found.chains, self.explorers, self.seed, self._polish)
@@ -281,32 +301,40 @@ class MPC:
         self._start = self._taken(), self.latest
         return self.rewind(t)
 
-    def _solved(self, x: Array, t: float) -> tuple[Search, Found]:
-        """The first solve.
+    def _solved(self, x: Array, t: float) -> tuple[Problem, Found, float]:
+        """The first solve: the problem in units of its constraints, what was found, and the floor.
 
         Where forces have no ends in plans, and nothing is found that keeps them in range, what is
         found with the true forces is the guess of another one.
         """
+        floor = 0.0
 
-        def search(
-            problem: Problem, solver: Restarts, guess: Trajectory | None = None
+        def searched(
+            problem: Problem, solver: Restarts, guess: Trajectory | Warm | None = None
         ) -> tuple[Search, Found]:
-            family = Family.of_one(problem.with_x_init(x).at_time(t))
-            one = Search(family, self.chains, self.seed, solver, guess=guess)
-            found = one.run()
+            nonlocal floor
+            search = Search(Family.of_one(problem), self.chains, self.seed, solver, guess=guess)
+            found, floor = search.run(), float(search.stage.floor[0])
             if found.interrupted:
                 raise KeyboardInterrupt
-            return one, found
+            return search, found
 
-        first = search(self.problem, self.solver)
-        if self._true is None or first[1].chains.sound.any():
-            return first
-        chains = search(*self._true)[1].chains
-        if not chains.sound.any():
-            return first
-        best = chains.order()[0, 0]
-        knots = jax.tree.map(lambda a: a[best], chains.state.trajectory)
-        return search(self.problem, self.solver, replace(knots, slack=None))
+        problem = self.problem.with_x_init(x).at_time(t)
+        if self._in_steps:
+            both = both_of(problem)
+            assert both is not None  # for the type checker
+            solved, found = found_in_steps(problem, both, self.solver, searched)
+            # the polish of the steps had constraints of its own
+            state = jax.vmap(partial(interior_point.begin, solved))(found.chains.state)
+            return solved, replace(found, chains=replace(found.chains, state=state)), floor
+        search, found = searched(problem, self.solver)
+        if self._true is not None and not found.chains.sound.any():
+            true, solver = self._true
+            chains = searched(true.with_x_init(x).at_time(t), solver)[1].chains
+            best = chains.order()[0, 0]
+            knots = jax.tree.map(lambda a: a[best], chains.state.trajectory)
+            search, found = searched(problem, self.solver, replace(knots, slack=None))
+        return search.family.problem, found, floor
 
     def rewind(self, t: float = 0.0) -> Plan:
         """Go back to the plan that the last `reset` made, at time t [s], without solving again."""

@@ -148,7 +148,7 @@ class Trials:
         latencies = np.concatenate([s.latencies for s in runs])
         some = len(latencies) > 0
         judged = [m.reached for m in self.motions if m.reached is not None]
-        driven = [_cost(policy, m) for m in self.motions]
+        driven, worst = zip(*(_driven(policy, m) for m in self.motions), strict=True)
         return {
             "task": policy.problem.name,
             "device": jax.devices()[0].device_kind,
@@ -168,18 +168,24 @@ class Trials:
                 f"p{p}": float(np.percentile(latencies, p)) if some else None for p in PERCENTILES
             },
             "failed_plans": sum(s.failed for s in runs),
+            "infeasible_plans": sum(s.infeasible for s in runs),
             "switches": sum(s.switches for s in runs),
             "runs": len(self.motions),
             "reached": sum(judged) if judged else None,
             "success_rate": float(np.mean(judged)) if judged else None,
             "cost": float(np.mean(driven)),
-            "costs": driven,
+            "costs": list(driven),
+            "broken": {kind: max(each[kind] for each in worst) for kind in worst[0]},
             "pushes": [[vars(push) for push in m.pushes] for m in self.motions],
         }
 
 
-def _cost(policy: MPC, motion: Motion) -> float:
-    """phi at the end plus the running cost at the start of every control step that was driven."""
+def _driven(policy: MPC, motion: Motion) -> tuple[float, dict[str, float]]:
+    """What a run came to.
+
+    Its cost, phi at the end plus the running cost at the start of every control step. And by how
+    much it broke constraints of the stages and bounds of states, in the user's units.
+    """
     problem = policy.original
     problem, dynamics = problem.at_time(float(motion.times[0])), problem.dynamics
     each = round(float(dynamics.dt) / (motion.times[1] - motion.times[0]))
@@ -195,7 +201,17 @@ def _cost(policy: MPC, motion: Motion) -> float:
     if problem.data_at is not None:
         whole = replace(whole, data=data_rows(problem.data_at, whole.times))
     driven_knots = Trajectory(jnp.asarray(x[1:]), jnp.asarray(u))
-    return float(jax.jit(Problem.cost)(whole, driven_knots))
+    rows = np.asarray(jax.jit(Problem.constraints)(whole, driven_knots).stage)
+    equal, box = problem.constraint.equalities, problem.bounds
+    own = slice(policy.original.dynamics.given_nx)
+    above, below = x[1:] - np.asarray(box.x_upper), np.asarray(box.x_lower) - x[1:]
+    broken = {
+        "equality": np.abs(rows[:, :equal]),
+        "inequality": rows[:, equal:],
+        "state bounds": np.maximum(above, below)[:, own],
+    }
+    worst = {kind: float(by.max(initial=0.0)) for kind, by in broken.items() if by.size}
+    return float(jax.jit(Problem.cost)(whole, driven_knots)), worst
 
 
 def lines(numbers: dict[str, Any]) -> list[str]:
@@ -208,6 +224,7 @@ def lines(numbers: dict[str, Any]) -> list[str]:
     waits = "in real time" if numbers["realtime"] else "the plant waits for each plan"
     share = numbers["success_rate"]
     count = sum(map(len, numbers["pushes"]))
+    broken = ", ".join(f"{kind} by {by:.2g}" for kind, by in numbers["broken"].items() if by > 0)
     outcome = (
         "no goal to judge by"
         if share is None
@@ -215,9 +232,11 @@ def lines(numbers: dict[str, Any]) -> list[str]:
     )
     return [
         f"rate      {rate} on {numbers['device']}; {waits}",
-        f"latency   {latency} over {numbers['plans']} plans, {numbers['failed_plans']} failed",
+        f"latency   {latency} over {numbers['plans']} plans, {numbers['failed_plans']} failed, "
+        f"{numbers['infeasible_plans']} infeasible",
         f"cost      {numbers['cost']:.4g} a run of {numbers['duration']:g} s, on average",
         f"runs      {outcome}; {count} pushes in all",
+        *([f"broken    {broken}, at most"] if broken else []),
     ]
 
 

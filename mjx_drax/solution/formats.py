@@ -195,7 +195,8 @@ def save_dataset(
             problem = solution.problem
             group = file.create_group(f"{i:03d}_{problem.name.replace('/', '_')}")
             group.attrs["problem"], group.attrs["engine"] = problem.name, solution.engine
-            group.attrs["seed"], group.attrs["dt"] = solution.seed, float(problem.dynamics.dt)
+            dt = np.nan if problem.dynamics.phases else float(problem.dynamics.dt)
+            group.attrs["seed"], group.attrs["dt"] = solution.seed, dt
             group.attrs["state_names"] = state_names(problem.dynamics)
             group.attrs["control_names"] = control_names(problem.dynamics)
             times = solution.times

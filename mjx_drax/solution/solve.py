@@ -37,6 +37,7 @@ from mjx_drax.solution.violations import (
     Tolerances,
     as_tolerances,
     warn_of_box,
+    warn_of_controls_at_the_end,
     warn_of_loose_ends,
 )
 
@@ -188,6 +189,10 @@ def solve(
             plans, u = solution.plans.astype(float), np.asarray(solution.trajectories.u)
             family = Family.of_one(solution.problem)
             warn_of_loose_ends(family, plans, u, tolerances, solution.best_chain)
+            states, controls = solution.replayed
+            warn_of_controls_at_the_end(
+                solution.problem, states[-1], controls[-1], float(solution.times[-1])
+            )
     return solution
 
 

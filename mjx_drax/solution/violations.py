@@ -35,6 +35,9 @@ from mjx_drax.base.errors import DraxError, DraxWarning, require_not_negative, s
 from mjx_drax.base.numbers import numbers
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.kernels.linalg import full_precision
+from mjx_drax.kernels.pruning import needed_program
+from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
@@ -338,6 +341,49 @@ def warn_of_loose_ends(
                 f"x_init is off the {words(kind)} [{entry}] by {off_by[entry]:.1e} only, and "
                 f"{allowed[entry]:.1e} is tolerated, so its certificate says little: give "
                 f"tolerances=Tolerances({kind}=...), or an x_scatter as wide as the motion.",
+                DraxWarning,
+                stacklevel=3,
+            )
+
+
+def warn_of_controls_at_the_end(
+    problem: Problem, x: np.ndarray, u: np.ndarray, time: float
+) -> None:
+    """Warn where what is asked of the end reads forces, which have no control to follow there.
+
+    Args:
+        problem: of a model; of functions nothing is said.
+        x, u: where the best replay ends (nx,), and its last control (nu,).
+        time: when [s].
+    """
+    model = mjx_dynamics(problem.dynamics)
+    if model is None:
+        return
+    instead = "Ask for positions and velocities, and bound forces by an inequality of the stages."
+    if problem.goal is not None:
+        data = problem.dynamics.observe_replayed(x, time)
+        without = bool(problem.goal(data))
+        data.ctrl[:] = u
+        mujoco.mj_forward(data.model, data)
+        if bool(problem.goal(data)) != without:
+            warnings.warn(
+                f"the goal is asked with controls of 0, as the end has none, and says {without}; "
+                f"with the last controls it says {not without}. {instead}",
+                DraxWarning,
+                stacklevel=3,
+            )
+    end = problem.end
+    if end.terminal_constraint.rows:
+        with problem.arithmetic():
+            program, _, _ = needed_program(
+                lambda x, u: end.terminal_constraint(end.dynamics.observe(x, u)),
+                (problem.x_init, jnp.zeros(problem.dynamics.nu)),
+            )
+        control = program.jaxpr.invars[-1]
+        if any(control in operation.invars for operation in program.jaxpr.eqns):
+            warnings.warn(
+                "terminal constraints read what follows from the controls, as forces and "
+                f"accelerations do; they get it for controls of 0, as the end has none. {instead}",
                 DraxWarning,
                 stacklevel=3,
             )

@@ -26,6 +26,7 @@ from mjx_drax import (
     from_function,
     from_mjcf,
 )
+from mjx_drax.base.errors import DraxWarning
 from mjx_drax.cli import main
 from mjx_drax.control import mpc
 from mjx_drax.control import trials as loop
@@ -99,7 +100,9 @@ def test_a_pendulum_is_balanced_after_a_push_without_recompiling(policy):
     assert policy.statistics.plans == 59
     assert policy.statistics.failed == 0
     assert np.median(policy.statistics.max_defects) < 1e-4
-    assert repr(policy.statistics).startswith("<Statistics of 59 plans: median ")
+    infeasible = policy.statistics.infeasible
+    said = repr(policy.statistics)
+    assert said.startswith(f"<Statistics of 59 plans, {infeasible} infeasible: median ")
     assert repr(policy.latest).startswith("<Plan of ")
 
 
@@ -146,11 +149,11 @@ def test_a_chain_that_is_alone_is_led_back_after_a_push():
     assert defects[1] < 0.2 * defects[0]
 
 
-def servo(integrator="implicitfast"):
+def servo(integrator="implicitfast", joint=""):
     """A pendulum that a servo of little force brings to 1 rad."""
     text = f"""
     <mujoco><option timestep="0.01" integrator="{integrator}"/><worldbody><body>
-      <joint name="one" axis="0 1 0" damping="0.3"/>
+      <joint name="one" axis="0 1 0" damping="0.3" {joint}/>
       <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03" mass="1"/>
     </body></worldbody><actuator>
       <position joint="one" kp="60" kv="4" ctrlrange="-4 4" forcerange="-6 6"/>
@@ -206,6 +209,20 @@ def test_servos_start_from_a_plan_with_their_true_forces_where_none_else_is_foun
     assert again.guess is not None
     assert plan.max_defect < 1e-3
     np.testing.assert_allclose(plan.x[-1], [1.0, 0.0], atol=0.05)
+
+
+@pytest.mark.slow
+def test_servos_with_dry_friction_are_solved_in_steps_first(monkeypatch):
+    searches = []
+    run = Search.run
+    monkeypatch.setattr(Search, "run", lambda search: searches.append(search) or run(search))
+    problem = servo(joint='frictionloss="0.05"')
+    policy, plant = MPC(problem, chains=2, explorers=0, solver=FAST), Plant(problem)
+    policy.reset(plant.measured())
+    assert len(searches) >= 2
+    while plant.time < 2.0:
+        plant.step(policy(plant.measured(), plant.time))
+    np.testing.assert_allclose(plant.state, [1.0, 0.0], atol=0.1)
 
 
 @pytest.mark.slow
@@ -576,6 +593,33 @@ def test_the_command_refuses_before_it_compiles(capsys):
     assert main(["mpc", "cartpole", "--pushes", "-1"]) == 2
     assert main(["mpc", "bug_trap"]) == 2
     assert "no model to simulate" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_what_a_run_breaks_and_what_no_plan_keeps_is_told():
+    problem = from_mjcf(
+        SLIDER,
+        horizon=0.5,
+        dt=0.02,
+        x_bounds=([-0.3, -9.0], [9.0, 9.0]),
+        running_residual=lambda data, u: 0.1 * u,
+        inequality=lambda data, u: data.qpos - 0.1,
+        terminal_equality=lambda data: data.qpos - 99.0,
+    )
+    policy = MPC(problem, chains=2, explorers=0, solver=FAST)
+    with pytest.warns(DraxWarning, match="no plan of the first solve is feasible"):
+        policy.reset(problem.x_init)
+    times = 0.02 * np.arange(31)
+    states = np.zeros((31, 2))
+    states[20, 0], states[25, 0] = 0.35, -0.7
+    statistics = mpc.Statistics([0.1] * 3, [0.0] * 3, [1e-6, 2e-3, 5.0])
+    motion = loop.Motion(times, states, np.zeros((30, 1)), statistics, True, [], np.zeros((30, 0)))
+    numbers = loop.Trials(policy, 0.6, False, [motion]).summary()
+    assert numbers["broken"] == pytest.approx({"inequality": 0.25, "state bounds": 0.4}, rel=1e-5)
+    assert numbers["infeasible_plans"] == 2
+    said = "\n".join(loop.lines(numbers))
+    assert "0 failed, 2 infeasible" in said
+    assert "broken    inequality by 0.25, state bounds by 0.4, at most" in said
 
 
 def test_a_goal_is_asked_at_the_time_of_the_plant(slider):

@@ -17,6 +17,7 @@ from mjx_drax import (
     Tolerances,
     Trajectory,
     from_function,
+    from_mjcf,
     minimize,
     solve,
     solve_batch,
@@ -31,6 +32,7 @@ from mjx_drax.solution.violations import (
     KINDS,
     Violation,
     most_broken,
+    warn_of_controls_at_the_end,
     warn_of_loose_ends,
     worst_knots,
 )
@@ -486,3 +488,26 @@ def test_the_worst_of_a_plan_is_relative_to_what_plans_may_break():
     assert worst == broken._replace(allowed=FEASIBLE)
     assert most_broken(two, [bounds], of_dynamics) is of_dynamics
     assert most_broken(two, []) is None
+
+
+SERVO = """<mujoco><option timestep="0.01"/><worldbody>
+  <body><joint name="j" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0" mass="1"/></body></worldbody>
+  <actuator><position joint="j" kp="40" ctrlrange="-2 2"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"goal": lambda data: abs(data.actuator_force[0]) < 1.5}, ["the goal is asked with"]),
+        ({"goal": lambda data: abs(data.actuator_force[0]) < 99.0}, []),
+        ({"goal": lambda data: abs(data.qpos[0]) < 1.5}, []),
+        ({"terminal_inequality": lambda data: data.actuator_force - 1.5}, ["terminal constraints"]),
+        ({"terminal_inequality": lambda data: data.qpos - 1.5}, []),
+    ],
+)
+def test_what_reads_forces_at_the_end_is_warned_of(asked, told):
+    problem = from_mjcf(SERVO, horizon=0.1, running_residual=lambda data, u: u, **asked)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        warn_of_controls_at_the_end(problem, np.array([0.02, 0.0]), np.array([-0.05]), 0.1)
+    assert [str(w.message)[: len(start)] for w, start in zip(found, told, strict=True)] == told
