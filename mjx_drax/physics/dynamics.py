@@ -448,9 +448,14 @@ class MjxDynamics(Dynamics):
                     return i, f"{a!r} touches {b!r}"
         return None
 
+    @cached_property
+    def _sound(self) -> mujoco.MjModel:
+        """The C engine's model, whose contact solver converges; to copy one may take long."""
+        return converged(self.mj_model)
+
     def observer(self) -> Callable[[np.ndarray, float], mujoco.MjData]:
         """`observe_replayed` for many states, in one MjData, which takes long to make."""
-        model = converged(self.mj_model)
+        model = self._sound
         data = mujoco.MjData(model)
 
         def observe(x: np.ndarray, time: float) -> mujoco.MjData:

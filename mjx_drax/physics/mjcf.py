@@ -248,11 +248,8 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
                 f"model_numbers returned {field!r} of shape {shape}, and the model has {has}: "
                 f"return {give}."
             )
-    ends, bounded = (
-        {"jnt_range", "jnt_margin"} & set(found),
-        dynamics.mj_model.jnt_limited.astype(bool),
-    )
-    if ends and (bounded & (np.asarray(dynamics.model.jnt_limited) == 0)).any():
+    ends = {"jnt_range", "jnt_margin"} & set(found)
+    if ends and (dynamics.mj_model.jnt_limited != np.asarray(dynamics.model.jnt_limited)).any():
         raise DraxError(
             f"model_numbers returned {min(ends)!r}, but the ranges of joints that are driven are "
             "bounds of the plan: give the model wide ranges, and an inequality that reads "

@@ -92,9 +92,8 @@ def ends_of(model: mjx.Model, time: float = 0.0) -> Ends | None:
     single &= np.isin(model.actuator_biastype, _LINEAR)
     own = np.asarray(model.actuator_forcelimited).astype(bool)
     # Where actuators compensate gravity, the range of the joint is not theirs alone
-    theirs = np.asarray(model.jnt_actfrclimited).astype(bool) & ~np.asarray(
-        model.jnt_actgravcomp
-    ).astype(bool)
+    limited, lifts = (np.asarray(a, bool) for a in (model.jnt_actfrclimited, model.jnt_actgravcomp))
+    theirs = limited & ~lifts
     of_joint = theirs[joint] if model.njnt else own
     (which,) = np.nonzero(single & (own | of_joint))
     if not which.size:
