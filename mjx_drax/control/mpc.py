@@ -314,9 +314,10 @@ class MPC:
         ) -> tuple[Search, Found]:
             nonlocal floor
             search = Search(Family.of_one(problem), self.chains, self.seed, solver, guess=guess)
-            found, floor = search.run(), float(search.stage.floor[0])
+            found = search.run()
             if found.interrupted:
                 raise KeyboardInterrupt
+            floor = float(search.stage.floor[0])
             return search, found
 
         problem = self.problem.with_x_init(x).at_time(t)

@@ -509,16 +509,16 @@ def test_what_a_run_cost_counts_its_own_times(by):
         times = begin + DT / 2 * np.arange(61)  # the plant takes two steps for each control
         states = np.stack([np.sin(times), 0 * times], axis=1)
         motion = loop.Motion(times, states, np.zeros((60, 1)), None, None, (), np.zeros((60, 0)))
-        assert loop._cost(SimpleNamespace(original=problem), motion) < 1e-9
+        assert loop._driven(SimpleNamespace(original=problem), motion)[0] < 1e-9
         motion.states[:, 0] += 0.1
-        cost = loop._cost(SimpleNamespace(original=problem), motion)
+        cost, _ = loop._driven(SimpleNamespace(original=problem), motion)
         assert cost == pytest.approx(31 * 0.01, rel=1e-3)
 
 
 def test_ctrl_c_in_the_first_solve_ends_the_program(slider, monkeypatch):
     policy = MPC(slider, chains=2, explorers=0, solver=FAST)
     stopped = SimpleNamespace(run=lambda: SimpleNamespace(interrupted=True))
-    monkeypatch.setattr(mpc, "Search", lambda *_: stopped)
+    monkeypatch.setattr(mpc, "Search", lambda *_, **__: stopped)
     with pytest.raises(KeyboardInterrupt):
         policy.reset(slider.x_init)
 
