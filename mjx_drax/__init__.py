@@ -15,7 +15,7 @@ from importlib.util import find_spec
 import lazy_loader
 
 from mjx_drax import _checkout as _checkout
-from mjx_drax.base.xla import sum_rightly
+from mjx_drax.base.xla import avoid_wrong_sums
 
 # XLA logs alarms about slow compiles and other machines' programs, as errors; what fails raises an
 # exception all the same. JAX itself says 1 where the user says nothing.
@@ -23,7 +23,7 @@ if "TF_CPP_MIN_LOG_LEVEL" not in os.environ or (
     "jax" in sys.modules and os.environ["TF_CPP_MIN_LOG_LEVEL"] == "1"
 ):
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
-sum_rightly()
+avoid_wrong_sums()
 
 _public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -17,7 +17,7 @@ WRONG_FROM, RIGHT_FROM = (0, 10, 2), (0, 11, 2)
 squares for example, as soon as there are some hundred numbers (jax-ml/jax issue 39103)."""
 
 
-def sum_rightly() -> None:
+def avoid_wrong_sums() -> None:
     """Set the flag where it is needed, unless it is set: XLA reads it when it first computes.
 
     Warns if it has computed already, on a CPU.

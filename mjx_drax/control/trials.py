@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from mjx_drax.base.errors import DraxError, require_positive, require_whole
 from mjx_drax.control.background import Background
@@ -23,7 +24,7 @@ from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Trajectory
+from mjx_drax.problem.trajectory import Stagewise, Trajectory
 
 SETTLE = 4.0
 """Time without pushes at the end of a run [s], at least."""
@@ -201,7 +202,8 @@ def _driven(policy: MPC, motion: Motion) -> tuple[float, dict[str, float]]:
     if problem.data_at is not None:
         whole = replace(whole, data=data_rows(problem.data_at, whole.times))
     driven_knots = Trajectory(jnp.asarray(x[1:]), jnp.asarray(u))
-    rows = np.asarray(jax.jit(Problem.constraints)(whole, driven_knots).stage)
+    cost, found = _cost_and_constraints(whole, driven_knots)
+    rows = np.asarray(found.stage)
     equal, box = problem.constraint.equalities, problem.bounds
     own = slice(policy.original.dynamics.given_nx)
     above, below = x[1:] - np.asarray(box.x_upper), np.asarray(box.x_lower) - x[1:]
@@ -211,7 +213,12 @@ def _driven(policy: MPC, motion: Motion) -> tuple[float, dict[str, float]]:
         "state bounds": np.maximum(above, below)[:, own],
     }
     worst = {kind: float(by.max(initial=0.0)) for kind, by in broken.items() if by.size}
-    return float(jax.jit(Problem.cost)(whole, driven_knots)), worst
+    return float(cost), worst
+
+
+@jax.jit
+def _cost_and_constraints(problem: Problem, knots: Trajectory) -> tuple[Array, Stagewise]:
+    return problem.cost(knots), problem.constraints(knots)
 
 
 def lines(numbers: dict[str, Any]) -> list[str]:

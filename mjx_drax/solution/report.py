@@ -71,7 +71,7 @@ def lines(solution: Results) -> list[str]:
     rate = f"{solution.success_rate:.1%} succeed when replayed"
     times = f"compile {solution.compile_time:.1f} s, solve {solution.solve_time:.1f} s"
     hints = (_fall(solution), _off_the_engine(solution)) if solution.certified else ()
-    between = [_between_knots(solution), _unplanned_contact(solution)] if solution.certified else []
+    unseen = [_between_knots(solution), _unplanned_contact(solution)] if solution.certified else []
     return [
         *([INTERRUPTED] if solution.interrupted else []),
         f"chains         {solution.chains}: {found}; {rate}",
@@ -80,7 +80,7 @@ def lines(solution: Results) -> list[str]:
         f"{solution.max_defect[best]:.1e}",
         *(f"{mode:14} {_replay(solution, mode)}" for mode in (OPEN_LOOP, WITH_FEEDBACK)),
         f"constraints    {constraints(solution)}",
-        *(f"               {said}" for said in between if said),
+        *(f"               {said}" for said in unseen if said),
         f"optimality     {solution.optimality}",
         *(f"               {hint}" for hint in hints if hint),
         *optima_lines(solution),

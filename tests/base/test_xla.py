@@ -62,5 +62,5 @@ def test_the_flag_is_set_for_versions_that_need_it_and_know_it(monkeypatch, inst
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     if flags is not None:
         monkeypatch.setenv("XLA_FLAGS", flags)
-    xla.sum_rightly()
+    xla.avoid_wrong_sums()
     assert os.environ.get("XLA_FLAGS") == then

@@ -49,7 +49,7 @@ from mjx_drax.physics._mjx import (
 )
 from mjx_drax.physics.contacts import boxes, curved, polytopes, solids, spheres
 from mjx_drax.physics.contacts.hull import Hull, hull_of, polytope
-from mjx_drax.physics.contacts.pairs import both_stay
+from mjx_drax.physics.contacts.pairs import numbered_pairs
 from mjx_drax.physics.contacts.spheres import APART, Contacts
 from mjx_drax.physics.engine import mujoco
 
@@ -124,9 +124,7 @@ def extended(left_out: Pairs = ()) -> Iterator[None]:
         def kept(model: Any) -> Iterator[tuple[int, int, int]]:
             out = {signature(*pair) for pair in left_out}
             out |= {int(s) for s in model.exclude_signature if s < 0}
-            for a, b, i in pairs(model):
-                if signature(a, b) not in out and (i >= 0 or not both_stay(model, a, b)):
-                    yield a, b, i
+            yield from (pair for pair in numbered_pairs(model) if signature(*pair[:2]) not in out)
 
         COLLISIONS.update(_OWN)
         collision_driver.geom_pairs = kept

@@ -40,14 +40,17 @@ def contact_pairs(model: mujoco.MjModel) -> Iterator[Pair]:
         yield from (pair[:2] for pair in numbered_pairs(model))
 
 
-def numbered_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
-    """All pairs that MJX looks at and MuJoCo too, each with the number of its <pair>, or -1."""
+def numbered_pairs(model: Any) -> Iterator[tuple[int, int, int]]:
+    """All pairs that MJX looks at and MuJoCo too, each with the number of its <pair>, or -1.
+
+    The model is MuJoCo's or MJX's.
+    """
     for a, b, i in geom_pairs(model):
-        if i >= 0 or not both_stay(model, a, b):
+        if i >= 0 or not _both_stay(model, a, b):
             yield int(a), int(b), int(i)
 
 
-def both_stay(model: Any, a: int, b: int) -> bool:
+def _both_stay(model: Any, a: int, b: int) -> bool:
     """Whether no joint moves either geom: MuJoCo lets none of the world's touch a mocap body's."""
     bodies = model.body_weldid[model.geom_bodyid[[a, b]]]
     return not model.body_dofnum[bodies].any()
