@@ -6,11 +6,13 @@ What they will need is tried before a long computation, not found missing after 
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import importlib.util
 import json
 import math
 import os
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -136,7 +138,10 @@ def require_room(path: str | os.PathLike[str], size: int = 1) -> None:
     _remove_left_over(target)
     with contextlib.suppress(_Tried), complete(target) as partial:
         with open(partial, "wb") as file:
-            os.posix_fallocate(file.fileno(), 0, size)
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+            elif shutil.disk_usage(target.parent).free < size:  # macOS
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         raise _Tried
 
 

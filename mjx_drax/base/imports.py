@@ -15,7 +15,9 @@ def imported(text: str) -> Any:
     """What MODULE:CLASS names, of a module that is installed or lies in the current folder."""
     module, _, name = text.partition(":")
     here = os.getcwd()
-    sys.path.append(here)
+    own = here not in sys.path
+    if own:
+        sys.path.append(here)
     try:
         return attrgetter(name)(import_module(module))
     except Exception as failure:  # the user's module may raise anything
@@ -24,4 +26,5 @@ def imported(text: str) -> Any:
             "that is installed or lies in the current folder."
         ) from failure
     finally:
-        sys.path.remove(here)
+        if own:
+            sys.path.remove(here)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 
 from mjx_drax import tasks
+from mjx_drax.base.errors import DraxError
 from mjx_drax.cli.common import at_least_1, say
 
 
@@ -27,29 +28,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("tasks", nargs="*", metavar="TASK", help="default: all of them")
     add("--suite", metavar="SUITE", help="default: each task as it is, alone")
-    add("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="S", help="default 0 1 2")
+    add("--seeds", type=int, nargs="+", metavar="S", help="default 0 1 2")
     add("--chains", type=at_least_1, metavar="N", help="default: each task's, or the suite's")
     add("--out", metavar="DIR", default="out/benchmark", help="default out/benchmark")
 
 
 def run(options: argparse.Namespace) -> int:
     """Print each row as it is ready, and save them all."""
+    names = options.tasks
     if options.suite is None:
-        for name in options.tasks:
-            tasks.full_name(name)  # answers at once, before heavy imports
+        names = [tasks.full_name(name) for name in names]  # answers at once, before heavy imports
     from mjx_drax.solution.files.save import writable
     from mjx_drax.studies import benchmark
     from mjx_drax.studies.convergence import suite
 
     if options.suite == suite.NAME:
-        suite.run(options.tasks, writable(options.out, file="convergence.json"), say)
+        if options.seeds or options.chains:
+            raise DraxError(
+                f"the suite {suite.NAME} solves from one guess, by one chain, without noise: leave "
+                "--seeds and --chains."
+            )
+        suite.run(names, writable(options.out, file="convergence.json"), say)
         return 0
-    benchmark.check(options.tasks, options.suite)
+    benchmark.check(names, options.suite)
     folder = writable(options.out, file="benchmark.json")
     say(benchmark.HEADER)
     rows = benchmark.run(
-        options.tasks,
-        options.seeds,
+        names,
+        options.seeds or [0, 1, 2],
         options.chains,
         options.suite,
         report=lambda row: say(benchmark.line(row)),

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 
 from mjx_drax.base.files import json_data
-from mjx_drax.cli.common import say
+from mjx_drax.cli.common import say, say_aside
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     keep_programs()
     report = check(
         options.model,
-        lambda line: print(line, file=sys.stderr, flush=True),
+        say_aside,
         options.contacts or True,
         options.actuators,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -25,6 +26,11 @@ def at_least_1(text: str) -> int:
 def say(line: str) -> None:
     """Print one line, at once."""
     print(line, flush=True)
+
+
+def say_aside(line: str) -> None:
+    """Print one line that is no result, at once."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def say_nothing(line: str) -> None:

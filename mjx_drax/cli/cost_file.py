@@ -98,7 +98,7 @@ def _require_no_slips(module: ModuleType, known: set[str], cost: str) -> None:
 
 
 def _module(path: Path) -> ModuleType:
-    """The cost file as a module; it can import files beside it."""
+    """The cost file as a module; it can import files beside it, also later, in its functions."""
     if not path.is_file():
         raise DraxError(f"there is no cost file {str(path)!r}: check the path.")
     spec = importlib.util.spec_from_file_location("mjx_drax_cost", path)
@@ -108,13 +108,13 @@ def _module(path: Path) -> ModuleType:
         )
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look there
-    sys.path.insert(0, str(path.resolve().parent))
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise DraxError(
             f"the cost file {str(path)!r} failed: {reason(error)}. Correct it there."
         ) from error
-    finally:
-        sys.path.pop(0)
     return module

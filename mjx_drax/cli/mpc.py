@@ -2,7 +2,7 @@
 
 A model, a task's or your own, is driven several times, with random pushes. Plans per second,
 latency, cost and the share of runs that end in the goal are printed; mpc.json is written. The exit
-status is 0 if all runs end in the goal.
+status is 0 if all runs end in the goal, or there is none.
 
 """
 
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     errors = {name: getattr(options, name) for name in ("mass", "noise", "shaking")}
     Plant(problem, **errors)  # refuses numbers that make no sense
     look = pictures.look_of(options)
-    if options.video:
+    if look or options.video:
         require_drawing(problem, **pictures.without_caption(look))
     folder = writable(options.out or Path("out") / f"mpc_{problem.name}", file="mpc.json")
     tell = say_nothing if options.json else say

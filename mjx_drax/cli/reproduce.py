@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--full",
         action="store_true",
-        help="the sizes of the paper, for a GPU; without it less than ten minutes on two CPU cores",
+        help="the sizes of the paper, for a GPU, where they are others; without it less than ten "
+        "minutes on two CPU cores",
     )
 
 

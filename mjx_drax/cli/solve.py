@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.cli import cost_file, export, pictures
-from mjx_drax.cli.common import at_least_1, say, say_nothing
+from mjx_drax.cli.common import at_least_1, say, say_aside, say_nothing
 from mjx_drax.cli.problem import Asked, add_problem, asked, require_known
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def _run(options: argparse.Namespace, stack: ExitStack) -> int:
     if options.live is not None:
         from mjx_drax.view.browser.viewer import live_page
 
-        page = live_page(problem, port=options.live, every=record or 5, told=tell)
+        page = live_page(problem, port=options.live, every=record or 5, told=say_aside)
         record = stack.enter_context(page)
 
     if options.checkpoint is not None and Path(options.checkpoint).expanduser().exists():

@@ -50,15 +50,18 @@ class Background:
         """The control (nu,) at time t [s] for the state x (nx,); the thread plans from them next.
 
         Raises:
+            DraxError: x or t is wrong, as for `MPC.control`; planning goes on.
             RuntimeError: planning failed; its cause is the error.
         """
         self._require_working()
         x = np.array(x, float)
+        u = self.policy.control(x, t)
+        self.policy.due(t)  # complains about a time before the plan, here and not in the thread
         if np.isfinite(x).all():
             with self._wanted:
                 self._newest = x, t
                 self._wanted.notify()
-        return self.policy.control(x, t)
+        return u
 
     def _require_working(self) -> None:
         if self._error is not None:

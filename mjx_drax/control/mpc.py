@@ -39,6 +39,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections import deque
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -99,22 +100,29 @@ BEYOND = 0.1
 """How far outside of its bounds a measured state may be, as a share of their width, or of that of
 the box of initial knots if it is less."""
 
+RECENT = 100_000
+"""So many plans are remembered one by one: a robot may run for days."""
+
 
 @dataclass
 class Statistics:
     """What a policy did since it was reset.
 
     Attributes:
-        latencies: time that each plan took [s].
-        costs, max_defects: of the plans.
+        latencies: time that each plan took [s], of the `RECENT` last ones.
+        costs, max_defects: of these plans.
+        plans: how many were made.
+        infeasible: plans that broke the dynamics or a constraint, by max|h|.
         failed: plans that were not finite; the last good one stayed in use.
         switches: plans that changed to another chain.
         unmeasured: states given that were not finite; the planned control was applied.
     """
 
-    latencies: list[float] = field(default_factory=list)
-    costs: list[float] = field(default_factory=list)
-    max_defects: list[float] = field(default_factory=list)
+    latencies: deque[float] = field(default_factory=partial(deque, maxlen=RECENT))
+    costs: deque[float] = field(default_factory=partial(deque, maxlen=RECENT))
+    max_defects: deque[float] = field(default_factory=partial(deque, maxlen=RECENT))
+    plans: int = 0
+    infeasible: int = 0
     failed: int = 0
     switches: int = 0
     unmeasured: int = 0
@@ -124,16 +132,6 @@ class Statistics:
         half, most = np.quantile(took, [0.5, 0.99])
         times = f"median {half:.2g} ms, 99 % within {most:.2g} ms"
         return f"<Statistics of {self.plans} plans, {self.infeasible} infeasible: {times}>"
-
-    @property
-    def plans(self) -> int:
-        """How many plans were made."""
-        return len(self.latencies)
-
-    @property
-    def infeasible(self) -> int:
-        """How many plans broke the dynamics or a constraint, by max|h|."""
-        return int((np.array(self.max_defects) >= FEASIBLE).sum())
 
 
 class MPC:
@@ -159,7 +157,7 @@ class MPC:
         seed: int = 0,
         solver: Langevin | Restarts | None = None,
     ) -> None:
-        """Nothing is compiled yet.
+        """What plans is compiled by `reset`.
 
         Args:
             problem: from `from_mjcf` or `from_function`; its x_init is replaced by what is given.
@@ -367,8 +365,10 @@ class MPC:
             plan = self._apply(self._taken(), x, t, by)
         statistics = self.statistics
         statistics.latencies.append(time.perf_counter() - clock)
+        statistics.plans += 1
         statistics.failed += not plan.finite
         if plan.finite:
+            statistics.infeasible += float(plan.max_defect) >= FEASIBLE
             statistics.switches += bool(plan.switched)
             statistics.costs.append(float(plan.cost))
             statistics.max_defects.append(float(plan.max_defect))

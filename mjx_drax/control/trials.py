@@ -20,6 +20,7 @@ from mjx_drax.control.background import Background
 from mjx_drax.control.mpc import MPC, Statistics
 from mjx_drax.control.open_quantities import driven
 from mjx_drax.control.plant import Plant, Push, random_pushes
+from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.problem.data import rows as data_rows
 from mjx_drax.problem.extended import Extended
@@ -47,6 +48,8 @@ class Motion:
         reached: whether the run ended in the goal; None without a goal.
         pushes: what it had to bear.
         further: the further states of the problem in the plan in use, (T, n).
+        behind: how far the plant fell behind the clock on the wall at most [s], where it runs by
+            it; else 0.
     """
 
     times: np.ndarray
@@ -56,6 +59,7 @@ class Motion:
     reached: bool | None
     pushes: Sequence[Push]
     further: np.ndarray
+    behind: float
 
 
 def simulate(
@@ -77,7 +81,7 @@ def simulate(
     """
     require_positive("duration", duration, "a positive number of seconds")
     times, states, controls, further = [plant.time], [plant.state], [], []
-    stop = plant.time + duration
+    stop, behind = plant.time + duration, 0.0
     with Background(policy) if realtime else nullcontext(policy) as act:
         began = time.perf_counter() - plant.time
         while plant.time < stop - 1e-9:
@@ -88,11 +92,13 @@ def simulate(
             times.append(plant.time)
             states.append(plant.state)
             if realtime:
-                time.sleep(max(0.0, began + plant.time - time.perf_counter()))
+                ahead = began + plant.time - time.perf_counter()
+                behind = max(behind, -ahead)
+                time.sleep(max(0.0, ahead))
     end = states[-1]
     reached = policy.problem.reached(end, plant.time) if np.isfinite(end).all() else False
     found = np.array(times), np.array(states), np.array(controls)
-    return Motion(*found, policy.statistics, reached, pushes, np.array(further))
+    return Motion(*found, policy.statistics, reached, pushes, np.array(further), behind)
 
 
 @dataclass(frozen=True)
@@ -147,7 +153,8 @@ class Trials:
         """What `mpc.json` holds. Costs are those of the problem, summed over the steps driven."""
         policy, runs = self.policy, [m.statistics for m in self.motions]
         latencies = np.concatenate([s.latencies for s in runs])
-        some = len(latencies) > 0
+        plans = sum(s.plans for s in runs)
+        some = plans > 0
         judged = [m.reached for m in self.motions if m.reached is not None]
         driven, worst = zip(*(_driven(policy, m) for m in self.motions), strict=True)
         return {
@@ -161,9 +168,10 @@ class Trials:
             "every": policy.every,
             "seed": policy.seed,
             "realtime": self.realtime,
+            "behind_s": max(m.behind for m in self.motions),
             "duration": self.duration,
             "first_solve_s": policy.first_solve,
-            "plans": len(latencies),
+            "plans": plans,
             "plans_per_s": float(1.0 / latencies.mean()) if some else None,
             "latency_s": {
                 f"p{p}": float(np.percentile(latencies, p)) if some else None for p in PERCENTILES
@@ -197,12 +205,13 @@ def _driven(policy: MPC, motion: Motion) -> tuple[float, dict[str, float]]:
         phases = (len(u),) * len(dynamics.phases)
         problem = replace(problem, dynamics=replace(dynamics, phases=phases))
     row = np.minimum(np.arange(len(u) + 1), problem.horizon)  # the last one stays
-    data = jax.tree.map(lambda a: a[row], problem.data)
-    whole = replace(problem, x_init=jnp.asarray(x[0]), horizon=len(u), data=data)
-    if problem.data_at is not None:
-        whole = replace(whole, data=data_rows(problem.data_at, whole.times))
-    driven_knots = Trajectory(jnp.asarray(x[1:]), jnp.asarray(u))
-    cost, found = _cost_and_constraints(whole, driven_knots)
+    with problem.arithmetic():
+        data = jax.tree.map(lambda a: a[row], problem.data)
+        whole = replace(problem, x_init=jnp.asarray(x[0]), horizon=len(u), data=data)
+        if problem.data_at is not None:
+            whole = replace(whole, data=data_rows(problem.data_at, whole.times))
+        driven_knots = Trajectory(jnp.asarray(x[1:]), jnp.asarray(u))
+        cost, found = _cost_and_constraints(whole, driven_knots)
     rows = np.asarray(found.stage)
     equal, box = problem.constraint.equalities, problem.bounds
     own = slice(policy.original.dynamics.given_nx)
@@ -217,6 +226,7 @@ def _driven(policy: MPC, motion: Motion) -> tuple[float, dict[str, float]]:
 
 
 @jax.jit
+@full_precision
 def _cost_and_constraints(problem: Problem, knots: Trajectory) -> tuple[Array, Stagewise]:
     return problem.cost(knots), problem.constraints(knots)
 
@@ -228,7 +238,9 @@ def lines(numbers: dict[str, Any]) -> list[str]:
     if numbers["plans"]:
         rate = f"{numbers['plans_per_s']:.1f} plans/s"
         latency = ", ".join(f"{p} {1e3 * s:.1f}" for p, s in numbers["latency_s"].items()) + " ms"
-    waits = "in real time" if numbers["realtime"] else "the plant waits for each plan"
+    waits = "the plant waits for each plan"
+    if numbers["realtime"]:
+        waits = f"in real time, {1e3 * numbers['behind_s']:.1f} ms behind the clock at most"
     share = numbers["success_rate"]
     count = sum(map(len, numbers["pushes"]))
     broken = ", ".join(f"{kind} by {by:.2g}" for kind, by in numbers["broken"].items() if by > 0)
@@ -264,7 +276,7 @@ def film(
     lines_ = [f"{problem.name}, model predictive control", "t = {time}"]
     lines_ += [f"push of {p.force[0]:+.1f} N on {p.body} at {p.time:.2f} s" for p in motion.pushes]
     qpos = motion.states[:, : model.nq]
-    strongest = max((np.linalg.norm(p.force) for p in motion.pushes), default=1.0)
+    strongest = max((np.linalg.norm(p.force) for p in motion.pushes), default=0.0) or 1.0
     length = ARROW * float(model.stat.extent)
 
     def arrows(time: float) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -275,7 +275,7 @@ class Rates:
         return jnp.concatenate([*own, *rows])
 
 
-def _with_rates(rates: Pair, inequality: Any, nu: int) -> Partial:
+def _with_rates(rates: Pair, inequality: Any, nu: int) -> Any:
     try:
         lower, upper = (np.broadcast_to(numbers(end), (nu,)).astype(float) for end in rates)
         good = bool((lower < upper).all())
@@ -287,5 +287,7 @@ def _with_rates(rates: Pair, inequality: Any, nu: int) -> Partial:
             f"upper, each ({nu},) or one number for all."
         )
     below, above = (tuple(map(int, np.flatnonzero(np.isfinite(e)))) for e in (lower, upper))
+    if not below + above:
+        return inequality
     low, high = (jnp.asarray(np.where(np.isfinite(e), e, 0.0), float) for e in (lower, upper))
     return as_partial(Rates(inequality, low, high, below, above))

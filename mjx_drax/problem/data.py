@@ -44,12 +44,16 @@ def rows(data: Any, times: np.ndarray) -> Any:
                 f"{name} is {shown(leaf)}: give arrays of numbers, a row for each of {count} knots."
             ) from error
         require_length(name, array, count)
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        with np.errstate(over="ignore"):
+            rounded = jnp.asarray(array)
+        wrong = ~np.isfinite(rounded) if array.dtype.kind == "f" else np.zeros(1)
+        if wrong.any():
+            at = tuple(np.argwhere(wrong)[0])
             raise DraxError(
-                f"{name} is not finite in row {int(np.argwhere(~np.isfinite(array))[0][0])}: give "
+                f"{name} is not finite in row {int(at[0])}, {array[at]} as {rounded.dtype}: give "
                 "numbers."
             )
-        return jnp.asarray(array)
+        return rounded
 
     return jax.tree_util.tree_map_with_path(row, data)
 

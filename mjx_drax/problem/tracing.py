@@ -26,6 +26,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 from jax.tree_util import Partial
 
+from mjx_drax.base.digests import plain_array
 from mjx_drax.base.errors import DraxError, reason, shown
 
 Arguments = tuple[Any, ...]
@@ -244,7 +245,7 @@ def _operations(jaxpr: Jaxpr) -> Iterator[Any]:
 
 
 def _bytes(value: Any) -> Any:
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value).tobytes()
+    return None if isinstance(value, jax.core.Tracer) else plain_array(value).tobytes()
 
 
 def require_derivatives(

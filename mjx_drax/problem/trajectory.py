@@ -203,7 +203,7 @@ def box(
 ) -> Box:
     """A box from (lower, upper) pairs, scalars or arrays that broadcast to (nx,) and (nu,).
 
-    A side that is None is free.
+    A pair that is None is free.
     """
 
     def end(value: ArrayLike, size: int, label: str) -> Array:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -326,6 +328,22 @@ def _certified(
     )
 
 
+def free_memory() -> int:
+    """Bytes that this process may still take of the host's memory.
+
+    Linux says how much programs could get, and what a container may use in all. Elsewhere half of
+    the memory counts as free.
+    """
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvail"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    with suppress(OSError, ValueError):  # there is no container, or it says "max"
+        free = min(free, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return free
+
+
 def fitting(problem: Problem, chains: int, devices: int = 1) -> int:
     """How many problems may be solved at a time, for the memory that is free now.
 
@@ -336,7 +354,7 @@ def fitting(problem: Problem, chains: int, devices: int = 1) -> int:
     if "bytes_limit" in stats:
         free = devices * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))
     else:
-        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        free = free_memory()
     width = problem.dynamics.ndx + problem.dynamics.nu
     each = COPIES * chains * problem.horizon * width**2 * problem.x_init.dtype.itemsize
     return max(1, int(SHARE * free // each))

@@ -52,7 +52,10 @@ def save_csv(solution: Solution, path: str | os.PathLike[str]) -> Path:
     require_solution(solution)
     states, controls = solution.replayed
     dynamics = solution.problem.dynamics
-    with complete(path, (".csv",)) as partial, partial.open("w", newline="") as file:
+    with (
+        complete(path, (".csv",)) as partial,
+        partial.open("w", newline="", encoding="utf-8") as file,
+    ):
         table = csv.writer(file)
         table.writerow(["time", *state_names(dynamics), *control_names(dynamics)])
         for k, (time, x) in enumerate(zip(solution.times, states, strict=True)):
@@ -79,9 +82,10 @@ def export_keyframes(solution: Solution, path: str | os.PathLike[str]) -> Path:
     """Write the model with the replay as its keyframes, for any MuJoCo viewer; returns the path.
 
     Keyframe `replay_k` holds time, qpos, qvel, act and ctrl at knot k, after those that the model
-    has. Meshes, textures and height fields are copied into a folder beside the file, NAME_assets,
-    so both can be moved together. Other numbers of the model are the file's, as MuJoCo writes them,
-    with six digits: parameters of a problem do not change them.
+    has; `replay2_k` if it has such already. Meshes, textures and height fields are copied into a
+    folder beside the file, NAME_assets, so both can be moved together. Other numbers of the model
+    are the file's, as MuJoCo writes them, with six digits: parameters of a problem do not change
+    them.
 
     Args:
         solution: from `solve`, of a problem from an MJCF file or string.
@@ -132,6 +136,9 @@ def _chosen_numbers(solution: Solution, model: mujoco.MjModel) -> str:
 
 def _keys(solution: Solution, model: mujoco.MjModel) -> Iterator[str]:
     """One element a knot; the last one keeps the last control."""
+    taken = [model.key(i).name for i in range(model.nkey)]
+    prefixes = ("replay_", *(f"replay{n}_" for n in range(2, len(taken) + 3)))
+    prefix = next(p for p in prefixes if not any(name.startswith(p) for name in taken))
     states, controls = solution.replayed
     ends = [model.nq, model.nq + model.nv]
     for k, (time, x) in enumerate(zip(solution.times, states, strict=True)):
@@ -141,7 +148,7 @@ def _keys(solution: Solution, model: mujoco.MjModel) -> Iterator[str]:
         parts = dict(zip(("qpos", "qvel", "act"), np.split(own, ends), strict=True))
         parts["ctrl"] = controls[min(k, len(controls) - 1)]
         numbers = "".join(f" {n}={quoteattr(_numbers(v))}" for n, v in parts.items() if v.size)
-        yield f'    <key name="replay_{k}" time="{time:.9g}"{numbers}/>'
+        yield f'    <key name="{prefix}{k}" time="{time:.9g}"{numbers}/>'
 
 
 def _numbers(values: npt.ArrayLike) -> str:

@@ -38,9 +38,9 @@ from mjx_drax.solution.violations import (
 OPEN_LOOP, WITH_FEEDBACK = "open loop", "with feedback"
 
 FOLLOWED = 0.1
-"""A replay that deviates by more than this share of the motion, and costs another amount by more
-than this share, is another motion: with a goal it may succeed, and its plan's residual says nothing
-of it."""
+"""A replay that deviates by more than this share of the motion in any coordinate, and costs another
+amount by more than this share, is another motion: with a goal it may succeed, and its plan's
+residual says nothing of it."""
 
 ROUNDING = 1e-5
 """Costs of replays, summed in float32, are alike if they differ by this share."""
@@ -51,8 +51,8 @@ class Replays:
     """What the engine did with every chain's controls.
 
     states (chains, K+1, nx), controls (chains, K, nu), largest deviation from the plan over the
-    whole motion and at its end, largest distance from the box of the bounds, cost, and whether it
-    succeeded, (chains,) each; and the largest violation of each kind.
+    whole motion and at its end, how far it leaves the bounds, cost, and whether it succeeded,
+    (chains,) each; and the largest violation of each kind.
     """
 
     states: np.ndarray
@@ -121,19 +121,20 @@ def followed(
     """Whether the better replays are the motions that were planned, (n,): in states, or in cost.
 
     Args:
-        plan: states, (n, knots, nx).
+        plan: states x_0..x_K, (n, K + 1, nx).
         cost: of the plans, (n,).
     """
     better = open_loop_is_better(open_loop, feedback)
-    off = np.where(better, open_loop.max_deviation, feedback.max_deviation)
+    states = np.where(better[:, None, None], open_loop.states, feedback.states)
     replayed = np.where(better, open_loop.cost, feedback.cost)
     with problem.arithmetic():
-        least = STILL * float(scatter_widths(problem)[0].max(initial=0.0))
+        least = STILL * np.asarray(scatter_widths(problem)[1])
     with np.errstate(invalid="ignore"):  # of plans that are not finite
-        moves = np.maximum(np.ptp(plan, axis=1).max(axis=1, initial=0.0), least)
+        off = np.abs(problem.dynamics.host_difference(states, plan)).max(axis=1, initial=0.0)
+        moves = np.maximum(extents(problem, plan, open_loop.controls)[1], least)
         most = np.maximum(np.abs(cost), np.abs(replayed))
         alike: np.ndarray = np.abs(replayed - cost) <= FOLLOWED * most
-    return (off <= FOLLOWED * moves) | alike
+    return (off <= FOLLOWED * moves).all(axis=1) | alike
 
 
 def replays(
@@ -206,7 +207,10 @@ def judged(
 
 
 def bounds_left(violations: Violations) -> np.ndarray:
-    """Largest distance from the box of the bounds, (motions,)."""
+    """How far motions leave the box of the bounds, (motions,).
+
+    The larger distance of two: of states and of controls, each where its violation is the largest.
+    """
     places = [KINDS.index(kind) for kind in ("state_bounds", "control_bounds")]
     return violations.size[:, places].max(axis=1)
 

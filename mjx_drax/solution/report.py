@@ -283,7 +283,7 @@ def _most_bounded(solution: Results) -> tuple[str, float]:
         (state_names(dynamics), knots.x[chain], box.x_lower, box.x_upper),
     ):
         low, high = (np.broadcast_to(side, z.shape) for side in (lower, upper))
-        boxed = np.isfinite(low) & np.isfinite(high)
+        boxed = np.isfinite(low) & np.isfinite(high) & (low < high)
         margin = ON_BOUND * np.where(boxed, high - low, 0.0)
         on = boxed & ((z <= low + margin) | (z >= high - margin))
         found += list(zip(on.sum(axis=0).tolist(), names, strict=True))
@@ -361,8 +361,6 @@ def _advice(solution: Results) -> str:
         worst = solution.max_defect
         alike = int(np.isclose(worst, worst[solution.best_chain], rtol=ALIKE_BROKEN).sum())
         if "equality" in where.kind and len(worst) > 2 and alike > len(worst) / 2:
-            if solution.problem.dynamics.nx == 0:  # a program has no horizon
-                more = []
             ways = [*(way for way in more if "iterations" not in way), "a guess"]
             return (
                 f"{told}. So do {alike} of {len(worst)} chains, as if what is asked had no "

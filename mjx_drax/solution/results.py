@@ -203,8 +203,8 @@ class Results:
     @cached_property
     def followed(self) -> np.ndarray:
         """Whether the better replay is the motion that was planned, to a tenth; (chains,)."""
-        x = np.asarray(self.trajectories.x)
-        return followed(self.problem, x, self.cost, self.open_loop, self.feedback)
+        replays = self.open_loop, self.feedback
+        return followed(self.problem, self.plans.astype(float), self.cost, *replays)
 
     @cached_property
     def status(self) -> list[str]:

@@ -22,6 +22,7 @@ from mjx_drax import tasks
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
+from mjx_drax.studies.measurements import task_and_chains
 
 DEFAULT = (
     "pendulum:16384",
@@ -77,8 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     print(start(), flush=True)
     for word in options.tasks:
-        name, _, chains = word.partition(":")
-        for row, _ in answers(tasks.load(name).make(), int(chains or 64), options.seeds):
+        name, chains = task_and_chains(word, 64)
+        for row, _ in answers(tasks.load(name).make(), chains, options.seeds):
             print(row, flush=True)
 
 

@@ -33,6 +33,7 @@ from mjx_drax.polish.interior_point import Polish, begin_inside
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.initial import initial_knots
 from mjx_drax.search.iterate import Question, iteration, start
+from mjx_drax.studies.measurements import task_and_chains
 from mjx_drax.studies.recursion import batch, median_seconds
 from mjx_drax.studies.robots import named
 
@@ -80,13 +81,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("|---" * 10 + "|")
     own = {} if options.horizon is None else {"horizon": options.horizon}
     for word in options.tasks:
-        name, _, chains = word.partition(":")
+        name, chains = task_and_chains(word, 32)
         problem = named(name, options.path, **own)
-        seconds, compiling = times(problem, int(chains or 32), options.repeats)
+        seconds, compiling = times(problem, chains, options.repeats)
         row = " | ".join(f"{1e3 * part:.2f}" for part in seconds)
-        print(
-            f"| {name} | {problem.horizon} | {chains or 32} | {row} | {compiling:.0f} |", flush=True
-        )
+        print(f"| {name} | {problem.horizon} | {chains} | {row} | {compiling:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

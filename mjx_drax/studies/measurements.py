@@ -40,6 +40,7 @@ import numpy as np
 from jax import Array
 
 from mjx_drax import __version__
+from mjx_drax.base.errors import DraxError, shown
 from mjx_drax.method.descent import Info
 from mjx_drax.method.langevin import Langevin
 from mjx_drax.physics.c_engine.stepper import cores
@@ -94,6 +95,20 @@ def machine() -> Row:
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
+
+
+def task_and_chains(word: str, usual: int) -> tuple[str, int]:
+    """The name of a task and a number of chains, of TASK:CHAINS, or the usual one of TASK.
+
+    Raises:
+        DraxError: CHAINS is no whole number of at least 1.
+    """
+    name, _, count = word.partition(":")
+    if not count:
+        return name, usual
+    if not count.isdecimal() or int(count) < 1:
+        raise DraxError(f"{shown(word)}: give TASK or TASK:CHAINS, a whole number of at least 1.")
+    return name, int(count)
 
 
 def row(problem: Problem, solver: str, seed: int, chains: int, **found: Any) -> Row:

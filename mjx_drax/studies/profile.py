@@ -32,6 +32,7 @@ from mjx_drax.polish.interior_point import Polish
 from mjx_drax.problem.problem import Problem
 from mjx_drax.search.restarts import Restarts, Rollouts
 from mjx_drax.solution.solve import solve
+from mjx_drax.studies.measurements import task_and_chains
 from mjx_drax.studies.robots import named
 
 
@@ -135,9 +136,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     polish = replace(usual, descent=10, polish=Polish(1e-30, n))
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}")
     for word in options.tasks:
-        name, _, chains = word.partition(":")
+        name, count = task_and_chains(word, 64)
         problem = named(name, options.path)
-        count = int(chains or 64)
         for what, solver in (("flow", flow), ("polish", polish)):
             if options.of in (None, what):
                 print(f"\n## {name}, {count} chains, {what}\n")

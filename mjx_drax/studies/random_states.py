@@ -101,8 +101,7 @@ def line(
 ) -> str:
     """The row of a solve, in Markdown."""
     upright = found.open_loop.success | found.feedback.success
-    cost = np.minimum(found.open_loop.cost, found.feedback.cost)
-    close = cost <= 1.2 * best + 1e-3
+    close = found.cost <= 1.2 * best + 1e-3
     residual = found.chain_residual.min(axis=1) < found.tolerance
     return (
         f"| {chains} | {attempts} | {seed} | {found.feasible.mean():.2%} | {residual.mean():.2%} "

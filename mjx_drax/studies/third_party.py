@@ -84,7 +84,9 @@ def complete_models(folder: Path, name: str) -> dict[str, Path]:
     for path in sorted([*folder.rglob("*.xml"), *folder.rglob("*.urdf")]):
         with contextlib.suppress(DraxError):
             if load(path).nv:
-                found[f"{name}/{path.relative_to(folder).with_suffix('')}"] = path
+                inside = path.relative_to(folder)
+                short = f"{name}/{inside.with_suffix('')}"
+                found[f"{name}/{inside}" if short in found else short] = path
     return found
 
 

@@ -19,6 +19,7 @@ from mjx_drax import tasks
 from mjx_drax.problem.problem import Problem
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.solve import solve
+from mjx_drax.studies.measurements import task_and_chains
 
 DEFAULT = ("pendulum:64", "cartpole_swingup:64", "bug_trap:64")
 
@@ -57,8 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     print(HEADER, flush=True)
     for word in options.tasks:
-        name, _, count = word.partition(":")
-        problem, chains = tasks.load(name).make(), int(count or 64)
+        name, chains = task_and_chains(word, 64)
+        problem = tasks.load(name).make()
         known = solve(problem, chains=chains)
         for change, other in neighbours(name, problem):
             cold = solve(other, chains=chains, seed=1)

@@ -163,7 +163,7 @@ def frame_moments(history: ChainHistory, seconds: float, fps: float) -> Floats:
     same = np.diff(history.attempt) == 0
     pace = np.where(same, fall / max(fall[same].sum(), 1e-9), 0.0)
     pace += np.where(same, motion / max(motion[same].sum(), 1e-9), 0.0)
-    pace = _EVEN / len(pace) + (1.0 - _EVEN) * pace / max(pace.sum(), 1e-9)
+    pace = _EVEN / max(len(pace), 1) + (1.0 - _EVEN) * pace / max(pace.sum(), 1e-9)
     reached = np.concatenate([[0.0], np.cumsum(pace)])
     moving = np.linspace(0.0, reached[-1], max(2, round(seconds * fps)))
     at = np.interp(moving, reached, np.arange(len(reached)))

@@ -5,8 +5,9 @@ What they write with is imported when it is needed, so that the command line lis
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from mjx_drax.base.files import require
 from mjx_drax.solution.export import Exporter
@@ -16,10 +17,22 @@ if TYPE_CHECKING:
     from mjx_drax.solution.solution import Solution
 
 
-class Html(Exporter):
+class _Written(Exporter):
+    """An exporter that calls a function (solution, path)."""
+
+    by: ClassVar[str]
+    """The function's module in this package, and its name, MODULE:FUNCTION."""
+
+    def write(self, solution: Solution, path: Path) -> None:
+        """Write the file; see the function."""
+        module, _, function = self.by.partition(":")
+        getattr(import_module(f"mjx_drax.{module}"), function)(solution, path)
+
+
+class Html(_Written):
     """The best chain's replay as one HTML file."""
 
-    name, file = "html", "replay.html"
+    name, file, by = "html", "replay.html", "view.browser.page:save_html"
     summary = 'the replay for any browser, one file; pip install "mjx-drax[view]"'
 
     def check(self, problem: Problem) -> None:
@@ -28,30 +41,18 @@ class Html(Exporter):
 
         require_viewer(problem)
 
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the page; see `browser.page.save_html`."""
-        from mjx_drax.view.browser.page import save_html
 
-        save_html(solution, path)
-
-
-class Csv(Exporter):
+class Csv(_Written):
     """The best chain's replay as a table."""
 
-    name, file = "csv", "replay.csv"
+    name, file, by = "csv", "replay.csv", "solution.formats:save_csv"
     summary = "times, states and controls of the replay as a table"
 
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the table; see `formats.save_csv`."""
-        from mjx_drax.solution.formats import save_csv
 
-        save_csv(solution, path)
-
-
-class Keyframes(Exporter):
+class Keyframes(_Written):
     """The best chain's replay as MJCF."""
 
-    name, file = "keyframes", "keyframes.xml"
+    name, file, by = "keyframes", "keyframes.xml", "solution.formats:export_keyframes"
     summary = "the model with the replay as keyframes, for MuJoCo's viewers"
 
     def check(self, problem: Problem) -> None:
@@ -60,25 +61,13 @@ class Keyframes(Exporter):
 
         mjcf_of(problem)
 
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the model; see `formats.export_keyframes`."""
-        from mjx_drax.solution.formats import export_keyframes
 
-        export_keyframes(solution, path)
-
-
-class Dataset(Exporter):
+class Dataset(_Written):
     """The certified chains as HDF5."""
 
-    name, file = "dataset", "dataset.h5"
+    name, file, by = "dataset", "dataset.h5", "solution.formats:save_dataset"
     summary = 'all certified chains as HDF5; pip install "mjx-drax[dataset]"'
 
     def check(self, problem: Problem) -> None:
         """Complain if h5py is not installed."""
         require("h5py", "dataset", "a dataset")
-
-    def write(self, solution: Solution, path: Path) -> None:
-        """Write the chains; see `formats.save_dataset`."""
-        from mjx_drax.solution.formats import save_dataset
-
-        save_dataset(solution, path)

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from mjx_drax import DraxError
 from mjx_drax.base.files import complete, require_room, write_json
 
 
@@ -17,6 +18,14 @@ def test_json_has_null_for_what_is_no_number(tmp_path):
     text = path.read_text(encoding="utf-8")
     assert json.loads(text) == {"a": [1.5, None, None], "b": [[1, 2]], "c": [True, "²"]}
     assert "²" in text
+
+
+def test_room_is_asked_for_where_files_cannot_be_allocated(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "posix_fallocate")  # as on macOS
+    require_room(tmp_path / "file.npz", 10)
+    with pytest.raises(DraxError, match="No space left"):
+        require_room(tmp_path / "file.npz", 10**18)
+    assert not list(tmp_path.iterdir())
 
 
 def test_json_keeps_names_that_utf_8_cannot_hold(tmp_path):

@@ -134,6 +134,8 @@ COMMANDS = [
     ("check-binary", lambda at: ["check", str(at.file("a.xml", b"\0\1"))], "a.xml"),
     ("benchmark-task", lambda at: ["benchmark", "tetris"], "tetris"),
     ("benchmark-suite", lambda at: ["benchmark", "--suite", "tpu"], "tpu"),
+    ("benchmark-convergence",
+     lambda at: ["benchmark", "--suite", "convergence", "--chains", "3"], "leave --seeds"),
     ("benchmark-seed", lambda at: ["benchmark", "pendulum", "--seeds", "x"], "--seeds"),
     ("reproduce", lambda at: ["reproduce", "figure-9"], "figure-9"),
     ("mpc-task", lambda at: ["mpc", "tetris"], "tetris"),

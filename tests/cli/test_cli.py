@@ -21,6 +21,7 @@ from mjx_drax.cli import cost_file, main, mpc, pictures
 from mjx_drax.control import trials
 from mjx_drax.physics.report import text
 from mjx_drax.search.engine import REPORT_EVERY
+from mjx_drax.studies import benchmark
 
 COST = """
 import jax.numpy as jnp
@@ -423,6 +424,14 @@ def test_errors_name_cause_and_fix(own, capsys, monkeypatch):
     assert "main" in error_of(capsys, "solve", "cartpole_swingup", "--camera", "side", *at)
     (own / "file").write_text("")
     assert "--out" in error_of(capsys, "solve", "pendulum", "--out", str(own / "file"))
+
+
+def test_benchmark_takes_the_beginnings_of_names(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(benchmark, "run", lambda names, *rest, report: asked.extend(names) or [])
+    monkeypatch.setattr(benchmark, "save", lambda rows, folder: [])
+    assert main(["benchmark", "cartp", "double", "--out", str(tmp_path)]) == 0
+    assert asked == ["cartpole_swingup", "double_pendulum_swingup"]
 
 
 @pytest.mark.slow

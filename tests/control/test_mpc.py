@@ -370,6 +370,18 @@ def test_a_thread_plans_beside_the_loop(policy):
     assert np.abs(x).max() < 0.1
 
 
+def test_a_wrong_call_is_refused_and_the_thread_plans_on(policy):
+    with Background(policy) as newest:
+        for x, t in (([0.5, 0.0], np.nan), ([0.5, 0.0], -9.0), ([0.5], DT)):
+            with pytest.raises(DraxError):
+                newest(x, t)
+        before = policy.statistics.plans
+        newest([0.5, 0.0], 5 * DT)
+        while policy.statistics.plans == before:
+            newest([0.5, 0.0], 5 * DT)
+            time.sleep(0.01)
+
+
 def test_an_error_in_the_thread_reaches_the_caller(policy, monkeypatch):
     def fail(x, t):
         raise ValueError("no")
@@ -508,7 +520,9 @@ def test_what_a_run_cost_counts_its_own_times(by):
     for begin in (0.0, 1.0):
         times = begin + DT / 2 * np.arange(61)  # the plant takes two steps for each control
         states = np.stack([np.sin(times), 0 * times], axis=1)
-        motion = loop.Motion(times, states, np.zeros((60, 1)), None, None, (), np.zeros((60, 0)))
+        motion = loop.Motion(
+            times, states, np.zeros((60, 1)), None, None, (), np.zeros((60, 0)), 0.0
+        )
         assert loop._driven(SimpleNamespace(original=problem), motion)[0] < 1e-9
         motion.states[:, 0] += 0.1
         cost, _ = loop._driven(SimpleNamespace(original=problem), motion)
@@ -612,14 +626,16 @@ def test_what_a_run_breaks_and_what_no_plan_keeps_is_told():
     times = 0.02 * np.arange(31)
     states = np.zeros((31, 2))
     states[20, 0], states[25, 0] = 0.35, -0.7
-    statistics = mpc.Statistics([0.1] * 3, [0.0] * 3, [1e-6, 2e-3, 5.0])
-    motion = loop.Motion(times, states, np.zeros((30, 1)), statistics, True, [], np.zeros((30, 0)))
-    numbers = loop.Trials(policy, 0.6, False, [motion]).summary()
+    statistics = mpc.Statistics([0.1] * 3, [0.0] * 3, [1e-6, 2e-3, 5.0], plans=3, infeasible=2)
+    of_plant = times, states, np.zeros((30, 1))
+    motion = loop.Motion(*of_plant, statistics, True, [], np.zeros((30, 0)), 0.002)
+    numbers = loop.Trials(policy, 0.6, True, [motion]).summary()
     assert numbers["broken"] == pytest.approx({"inequality": 0.25, "state bounds": 0.4}, rel=1e-5)
     assert numbers["infeasible_plans"] == 2
     said = "\n".join(loop.lines(numbers))
     assert "0 failed, 2 infeasible" in said
     assert "broken    inequality by 0.25, state bounds by 0.4, at most" in said
+    assert "in real time, 2.0 ms behind the clock at most" in said
 
 
 def test_a_goal_is_asked_at_the_time_of_the_plant(slider):

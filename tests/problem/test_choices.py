@@ -544,6 +544,24 @@ def test_bad_choices_are_named(changes, message):
         fastest(**changes)
 
 
+def test_functions_may_hold_random_keys():
+    key = jax.random.key(0)
+    noise = from_function(
+        lambda x, u: x + u,
+        x_init=[0.0],
+        nu=1,
+        dt=DT,
+        horizon=3 * DT,
+        running_cost=lambda x, u: (u[0] - jax.random.uniform(key)) ** 2,
+    )
+    assert noise.horizon == 3
+
+
+def test_endless_rate_bounds_ask_for_nothing():
+    problem = fastest(rate_bounds=(-np.inf, np.inf))
+    assert problem.constraint.rows == 0
+
+
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [

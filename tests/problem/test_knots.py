@@ -223,6 +223,7 @@ def test_float64_and_data():
         ({"data": np.zeros(7)}, r"data has shape \(7,\): give 11 rows"),
         ({"data": {"a": np.zeros((11, 2)), "b": 3.0}}, r"data\['b'\] has shape \(\)"),
         ({"data": np.full(11, NAN)}, "data is not finite in row 0"),
+        ({"data": np.full(11, 1e39)}, r"data is not finite in row 0, 1e\+39 as float32"),
         ({"data": ["a"] * 11}, r"data\[0\] is 'a'"),
         ({"data": lambda t: float(t)}, "data failed when it was traced"),
         ({"equality": at_time(lambda x, u: x, 3.0)}, "equality holds at 3 s, where it has no knot"),

@@ -91,6 +91,18 @@ def test_keyframes_hold_the_replay_and_the_model_finds_its_meshes(slider, tmp_pa
     np.testing.assert_allclose(model.body_mass, before.body_mass, rtol=1e-5)
 
 
+def test_keyframes_of_a_model_that_has_a_replay_have_names_of_their_own(slider, tmp_path):
+    path = export_keyframes(slider, tmp_path / "keys.xml")
+    dynamics = replace(slider.problem.dynamics, **_model_of(path))
+    again = replace(slider, problem=replace(slider.problem, dynamics=dynamics))
+    model = mujoco.MjModel.from_xml_path(str(export_keyframes(again, tmp_path / "more.xml")))
+    assert [model.key(i).name for i in (1, 27)] == ["replay_0", "replay2_0"]
+
+
+def _model_of(path):
+    return {"mj_model": mujoco.MjModel.from_xml_path(str(path)), "origin": path}
+
+
 def test_models_without_mjcf_have_no_keyframes(slider, tmp_path):
     with pytest.raises(DraxError, match="bug_trap has no MuJoCo model to write keyframes of"):
         mjcf_of(load("bug_trap").make())

@@ -411,16 +411,21 @@ def test_each_problem_of_a_batch_is_judged_by_its_own_constraint():
 
 
 def test_a_plan_that_its_replay_does_not_follow_is_not_called_optimal():
-    x = np.linspace(0.0, [[1.0], [1.0], [1.0], [1.0], [0.0]], 5, axis=1)  # (5, 5, 1)
-    off, cost = np.array([0.0, 2.0, 2.0, 0.05, 2e-8]), np.array([1.0, 1.0, 1.0, 1e-9, 1e-25])
-    replayed = np.array([1.0, 1.02, 50.0, 1e-7, 4e-15])  # the third reaches its goal another way
+    x = np.linspace(0.0, [[1.0, 0.0]] * 4 + [[0.0, 0.0], [100.0, 1.0]], 5, axis=1)  # (6, 5, 2)
+    off, cost = np.array([0.0, 2.0, 2.0, 0.05, 2e-8, 0.5]), np.array([1, 1, 1, 1e-9, 1e-25, 1])
+    replayed = np.array([1.0, 1.02, 50.0, 1e-7, 4e-15, 50.0])
     found = solve(point(), chains=2, progress=False)
-    ran = replace(found.feedback, max_deviation=off, cost=replayed, success=np.ones(5, bool))
+    states = x.copy()
+    states[:5, -1, 0] += off[:5]
+    states[5, 2, 1] += off[5]  # half of what this coordinate moves, little of what the other does
+    ran = replace(found.feedback, states=states, cost=replayed, success=np.ones(6, bool))
+    ran = replace(ran, controls=np.zeros((6, 4, 2)))
     kept = followed(found.problem, x, cost, ran, ran)
-    np.testing.assert_array_equal(kept, [True, True, False, True, True])  # the last one rests
+    # the third reaches its goal another way, the fifth rests
+    np.testing.assert_array_equal(kept, [True, True, False, True, True, False])
     assert found.optimal
     assert found.followed.all()
-    other = replace(found.feedback, max_deviation=np.full(2, 9.0), cost=found.feedback.cost + 1.0)
+    other = replace(found.feedback, states=found.plans + 9.0, cost=found.feedback.cost + 1.0)
     other = replace(found, feedback=other, open_loop=other)
     assert other.certified
     assert not other.optimal

@@ -213,6 +213,12 @@ def test_film_time_is_spent_where_knots_move() -> None:
     assert np.median(at) < 5.0
 
 
+def test_a_film_of_one_snapshot_stands_still() -> None:
+    at = diffusion.frame_moments(_timeline([0], [0]), 4.0, 25.0)
+    assert len(at) > 100
+    assert not at.any()
+
+
 def _timeline(iteration: list[int], attempt: list[int]) -> recording.ChainHistory:
     count = len(iteration)
     numbers = np.ones(count)

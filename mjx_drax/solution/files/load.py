@@ -69,7 +69,8 @@ def load(
             _require_same(problem, summary, arrays)
             problem = _as_solved(problem, arrays)
         units = [arrays.get(f"problem.{name}.unit") for name in CONSTRAINTS]
-        own = None if units[0] is None else Stagewise(*map(jnp.asarray, units))
+        with problem.arithmetic():
+            own = None if units[0] is None else Stagewise(*map(jnp.asarray, units))
         solution = _solution(cls, with_units(problem, own), summary, arrays)
         _require_consistent(solution, summary)
         return solution

@@ -17,7 +17,7 @@ SHARES = (
     "upright",
     "can be upright",
     "of those that can",
-    "within 1.2 times dynamic programming",
+    "of those, within 1.2 times dynamic programming",
     "feasible",
     "reaches goal",
     "with feedback",

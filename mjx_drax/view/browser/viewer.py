@@ -7,6 +7,7 @@ and hidden there. `Live` shows the knots of a solve while it runs. `show_nativel
 from __future__ import annotations
 
 import os
+import platform
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -149,7 +150,7 @@ class Live(Recorder):
         super().take(problem, sigma, done, z, info)
         shot = self.attempts[-1].snapshots[-1]
         infeasible, value = ranking(shot.cost, shot.max_defect)
-        if infeasible[self._chain]:
+        if self._chain >= len(infeasible) or infeasible[self._chain]:  # attempts differ in places
             self._chain = int(np.lexsort((value, infeasible))[0])
         chain, count = self._chain, min(_KNOTS, problem.horizon)
         knots = np.linspace(0, problem.horizon - 1, count).round().astype(int)
@@ -216,7 +217,8 @@ def show_natively(solution: Solution, until: threading.Event | None = None) -> N
     model = mujoco_model(solution.problem.dynamics, states[0])
     if model is None:
         raise DraxError(f"{solution.problem.name} has no MuJoCo model to show: see plot.png.")
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if platform.system() == "Linux" and not shown:
         raise DraxError("MuJoCo's viewer needs a display, and DISPLAY is not set: leave --native.")
     import mujoco.viewer as native
 
