@@ -438,8 +438,8 @@ def _moved(
         lower = jnp.where(alpha > KEEPS_DAMPING * reach, lower, kept)
     after = jnp.where(found, lower, higher)
     shortfall, present = worst(left, rows), worst(model.h, rows)
-    loose = (shortfall > LOOSE * present) & (present > polish.tolerance)
-    most = 1e-2 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
+    loose = (shortfall > LOOSE * present) & (jnp.maximum(present, shortfall) > polish.tolerance)
+    most = 1.0 / (SMALLEST * jnp.finfo(alpha.dtype).eps)  # D may be floored
     stiffness = jnp.where(loose, jnp.minimum(STIFFER * now.stiffness, most), now.stiffness)
     if knots.slack is not None:
         unmet = worst(Multipliers(left.dynamics, model.h.constraints), rows) > polish.tolerance
