@@ -256,8 +256,25 @@ def fields_of(dynamics: MjxDynamics, parameters: Any, numbers: Any) -> list[str]
             "knot.parameters."
         )
     for parameters in tried:
+        _refuse_missing(dynamics.mj_model, numbers(dynamics.model, parameters))
         set_numbers(copy.copy(dynamics.mj_model), numbers(dynamics.model, parameters))
     return list(found)
+
+
+def _refuse_missing(model: mujoco.MjModel, numbers: Any) -> None:
+    """Complain about numbers of what the model has not, which MJX or the C engine then leaves out.
+
+    Raises:
+        DraxError: dry friction or gravity compensation of what has none in the file.
+    """
+    for field in {"dof_frictionloss", "tendon_frictionloss", "body_gravcomp"} & set(numbers):
+        new = np.asarray(numbers[field]) != 0.0
+        if (new & (getattr(model, field) == 0.0)).any():
+            name = field.partition("_")[2]
+            raise DraxError(
+                f"model_numbers gives {field!r} to what has none in the file, and would change "
+                f'nothing there: write a small one into it, such as {name}="1e-6".'
+            )
 
 
 def steps_between_knots(

@@ -7,8 +7,10 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
     defects             h = 0             relative to how far each coordinate of the state moves
     constraints         r = 0             relative to what a row changes by as everything moves
     complementarity     v slack = 0       summed over all bounds, relative to the cost
+    price               lambda'h = 0      relative to the cost, of which this is what is amiss, to
+                                          first order, for what is left of defects and constraints
 
-and the residual is the largest of the four. How far a coordinate moves is measured from x_init, and
+and the residual is the largest of the five. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn from,
 or 0.01 where that has no width. The cost is measured by what its slope promises over the motion,
 sum |dc/du| |u| and a share of sum |dc/dx| |x|. So neither units nor constants that are added to it
@@ -69,10 +71,10 @@ class Scales:
 @register_dataclass
 @dataclass(frozen=True)
 class Residual:
-    """The four parts, scalars, and what the barrier is held against.
+    """The five parts, scalars, and what the barrier is held against.
 
     Attributes:
-        stationarity, defects, constraints, complementarity: relative.
+        stationarity, defects, constraints, complementarity, price: relative.
         error: the largest slope and defect as costs, for the barrier's weight.
     """
 
@@ -80,6 +82,7 @@ class Residual:
     defects: Array
     constraints: Array
     complementarity: Array
+    price: Array
     error: Array
 
     @property
@@ -89,8 +92,8 @@ class Residual:
 
     @property
     def total(self) -> Array:
-        """The largest of the four; infinite where one is not a number."""
-        largest = jnp.maximum(self.others, self.complementarity)
+        """The largest of the five; infinite where one is not a number."""
+        largest = jnp.maximum(jnp.maximum(self.others, self.complementarity), self.price)
         return jnp.where(jnp.isnan(largest), jnp.inf, largest)
 
 
@@ -136,11 +139,10 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     r = model.h.constraints
     of_stage, of_end = jnp.abs(r.stage) / (rows + tiny), jnp.abs(r.terminal) / (rows_end + tiny)
     gap = sum(jnp.sum(part) for part in jax.tree.leaves(products(problem, knots, v)))
-    forces = jnp.abs(model.h.dynamics * multipliers.dynamics).max(initial=0.0)
-    for part, force in zip(
-        jax.tree.leaves(r), jax.tree.leaves(multipliers.constraints), strict=True
-    ):
-        forces = jnp.maximum(forces, jnp.abs(part * force).max(initial=0.0))
+    prices = [model.h.dynamics * multipliers.dynamics]
+    prices += jax.tree.leaves(jax.tree.map(jnp.multiply, r, multipliers.constraints))
+    forces = jnp.max(jnp.stack([jnp.abs(part).max(initial=0.0) for part in prices]))
+    price = jnp.abs(sum(jnp.sum(part) for part in prices)) / cost
     slopes = (jnp.abs(dual.x) * x).max(initial=0.0), (jnp.abs(dual.u) * u).max(initial=0.0)
     error = jnp.maximum(forces, jnp.maximum(*slopes))
     if model.start is not None:
@@ -157,6 +159,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
         defects,
         jnp.maximum(of_stage.max(initial=0.0), of_end.max(initial=0.0)),
         jnp.where(flat, 0.0, gap / cost),
+        jnp.where(flat, 0.0, price),
         error,
     ), scales
 

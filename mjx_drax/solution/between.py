@@ -3,7 +3,7 @@
 Plans and certificates keep constraints at knots. A step of the C engine is a fraction of the time
 between two, so a replay shows what happens there. The knot before and the one after are both asked
 about a state between them, with their own times, data and controls: what only one of them forbids,
-as a constraint of chosen times does, is not counted. After the last stage there is no such knot.
+as a constraint of chosen times does, is not counted. After the last stage it is the one before.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.search.family import Family
 from mjx_drax.solution.results import Results
-from mjx_drax.solution.violations import INEQUALITY, Violation, extents, inequalities
+from mjx_drax.solution.violations import INEQUALITY, Violation, driven_extents, inequalities
 
 
 def broken_between_knots(solution: Results, chain: int) -> Violation | None:
@@ -26,18 +26,18 @@ def broken_between_knots(solution: Results, chain: int) -> Violation | None:
     dynamics = mjx_dynamics(problem.dynamics)
     if dynamics is None or dynamics is not problem.dynamics or dynamics.substeps == 1:
         return None
-    if not problem.constraint.inequalities:
+    if not problem.constraint.inequalities or problem.horizon < 2:
         return None
     ran = solution.replays_in(solution.mode_of(chain))
     states, u = ran.states[chain], ran.controls[chain]
     between = dynamics.between_knots(states[:-1], u).swapaxes(0, 1)
     before = np.repeat(states[None], len(between), axis=0)
-    after = before.copy()
-    before[:, :-1], after[:, 1:-1] = between, between[:, :-1]
-    size, allowed = _at_stages(solution, chain, np.concatenate([before, after]), u)
-    (size, behind), (allowed, most) = np.split(size, 2), np.split(allowed, 2)
-    size = np.minimum(size[:, :-1], behind[:, 1:])
-    allowed = np.maximum(allowed[:, :-1], most[:, 1:])
+    other, last = before.copy(), before.copy()
+    before[:, :-1], other[:, 1:-1], last[:, -3] = between, between[:, :-1], between[:, -1]
+    asked = _at_stages(solution, chain, np.concatenate([before, other, last]), u)
+    (size, *sizes), (allowed, *most) = (np.split(of_all, 3) for of_all in asked)
+    of_other = (np.concatenate([b[:, 1:], c[:, -2:-1]], axis=1) for b, c in (sizes, most))
+    size, allowed = np.minimum(size, next(of_other)), np.maximum(allowed, next(of_other))
     if not (size > allowed).any():
         return None
     share = np.where(size > allowed, size / np.maximum(allowed, np.finfo(float).tiny), 0.0)
@@ -53,9 +53,10 @@ def _at_stages(
     As many at a time as there are chains: what judges replays is compiled for these.
     """
     chains, plan = solution.chains, solution.plans[[chain]].astype(float)
-    extent = extents(solution.problem, plan, np.asarray(solution.trajectories.u[[chain]]))
-    own = tuple(np.repeat(each, chains, axis=0) for each in extent)
     family, controls = Family.of_one(solution.problem), np.repeat(u[None], chains, axis=0)
+    planned = np.asarray(solution.trajectories.u[[chain]])
+    extent = driven_extents(family, np.zeros(1, int), plan, planned)
+    own = tuple(np.repeat(each, chains, axis=0) for each in extent)
     found = []
     for i in range(0, len(states), chains):
         rows = np.resize(states[i : i + chains], (chains, *states.shape[1:]))

@@ -30,7 +30,9 @@ from mjx_drax.solution.violations import (
     Tolerances,
     Violation,
     Violations,
+    driven_extents,
     extents,
+    hangs_on_room,
     measured,
     scatter_widths,
 )
@@ -148,8 +150,9 @@ def replays(
         plan = np.asarray(problem.with_start(trajectories), float)
     u = np.asarray(trajectories.u)
     ran = problem.replay(plan, u, gains)
-    extent = extents(problem, plan, u)
-    return judged(Family.of_one(problem), plan, extent, ran, tolerances or Tolerances())
+    family = Family.of_one(problem)
+    extent = driven_extents(family, np.zeros(len(u), int), plan, u)
+    return judged(family, plan, extent, ran, tolerances or Tolerances())
 
 
 def both_ways(
@@ -163,11 +166,36 @@ def both_ways(
         u: planned controls, (n, K, nu).
         gains: feedback, (n, K, nu, ndx); see `Family.tracked`.
     """
-    which, extent = np.resize(np.arange(family.count), len(u)), extents(family.at(0), plan, u)
+    which = np.resize(np.arange(family.count), len(u))
+    extent = driven_extents(family, which, plan, u)
     open_loop = family.replay(which, plan, u, 0.0 * gains)
     found = family.tracked(which, plan, u, gains)
     feedback = judged(family, plan, extent, (found.states, found.controls), tolerances)
     return judged(family, plan, extent, open_loop, tolerances), feedback, found.gains
+
+
+def hang_on_room(
+    family: Family,
+    plan: np.ndarray,
+    u: np.ndarray,
+    replays: tuple[Replays, Replays],
+    tolerances: Tolerances,
+) -> np.ndarray:
+    """Whether the better replays `hangs_on_room`, (n,): they may keep constraints for it alone.
+
+    Args are those of `both_ways`, and its replays, open loop and with feedback.
+    """
+    problem = family.problem
+    if not problem.constraint.rows + problem.terminal_constraint.rows:
+        return np.zeros(len(u), bool)
+    better = open_loop_is_better(*replays)[:, None, None]
+    open_loop, feedback = replays
+    ran = (
+        np.where(better, open_loop.states, feedback.states),
+        np.where(better, open_loop.controls, feedback.controls),
+    )
+    extent = driven_extents(family, np.resize(np.arange(family.count), len(u)), plan, u)
+    return hangs_on_room(family, ran, extent, tolerances)
 
 
 def judged(
@@ -218,7 +246,8 @@ def bounds_left(violations: Violations) -> np.ndarray:
 def plan_violations(family: Family, plan: np.ndarray, u: np.ndarray) -> Violations:
     """Violations of plans themselves, but of the dynamics, by the default tolerances."""
     off = np.zeros((len(u), family.problem.dynamics.ndx))
-    found = measured(family, (plan, u), off, extents(family.at(0), plan, u), Tolerances())[1]
+    extent = driven_extents(family, np.resize(np.arange(family.count), len(u)), plan, u)
+    found = measured(family, (plan, u), off, extent, Tolerances())[1]
     found.allowed[:, KINDS.index(TRACKING)] = np.nan
     return found
 

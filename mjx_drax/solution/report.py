@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 from functools import partial
 from html import escape
 
@@ -13,6 +15,8 @@ import numpy as np
 from mjx_drax.base.errors import DraxError
 from mjx_drax.kernels.compilation import compiled
 from mjx_drax.physics.dynamics import mjx_dynamics
+from mjx_drax.physics.engine import mujoco
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Stagewise, Trajectory
 from mjx_drax.search.identity import identity
@@ -231,18 +235,40 @@ def _unplanned_contact(solution: Results) -> str:
 
 def _off_the_engine(solution: Results) -> str:
     """What there is to say where a step of MuJoCo leaves a certified plan: feasible by JAX's f."""
-    best = solution.best_chain
-    if mjx_dynamics(solution.problem.dynamics) is None:
+    where = _leaves(solution, solution.problem)
+    if where is None:
         return ""
-    broken = [v for v in of_engine(solution, best) if v.broken]
-    if not broken:
-        return ""
-    kind, size, allowed, entry, knot = max(broken, key=lambda v: v.ratio)
+    return f"of f as JAX has it: {_told_of_step(solution, where)}.{_stops(solution)}"
+
+
+def _told_of_step(solution: Results, where: Violation) -> str:
+    kind, size, allowed, entry, knot = where
     return (
-        f"of f as JAX has it: at knot {knot}, {solution.times[knot]:.3g} s, a step of MuJoCo ends "
-        f"{size:.1e} off in {entry_name(solution.problem, kind, entry)} ({allowed:.1e} tolerated)."
-        f"{_stops(solution)}"
+        f"at knot {knot}, {solution.times[knot]:.3g} s, a step of MuJoCo ends {size:.1e} off in "
+        f"{entry_name(solution.problem, kind, entry)} ({allowed:.1e} tolerated)"
     )
+
+
+def _leaves(solution: Results, problem: Problem) -> Violation | None:
+    """Where a step of MuJoCo leaves the best plan most; None where it does not, or for functions.
+
+    The problem may have another model than that of the solution.
+    """
+    if mjx_dynamics(problem.dynamics) is None:
+        return None
+    found = of_engine(replace(solution, problem=problem), solution.best_chain)
+    return max((v for v in found if v.broken), key=lambda v: v.ratio, default=None)
+
+
+def _met_stop(solution: Results) -> bool:
+    """Whether a step of MuJoCo would not leave the best plan if joints had no stops."""
+    whole, inner = solution.problem.dynamics, mjx_dynamics(solution.problem.dynamics)
+    assert inner is not None  # for the type checker
+    model = copy(inner.mj_model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    inner = replace(inner, mj_model=model)
+    endless = replace(whole, inner=inner) if isinstance(whole, Extended) else inner
+    return _leaves(solution, replace(solution.problem, dynamics=endless)) is None
 
 
 def _stops(solution: Results) -> str:
@@ -374,6 +400,12 @@ def _advice(solution: Results) -> str:
             f"at knot {knot}, {solution.times[knot]:.2f} s, {contact}, and the plan is made "
             "without contacts of these two. Add the pair to contacts=, or keep them apart by an "
             "inequality."
+        )
+    leaves = _leaves(solution, solution.problem)
+    if leaves is not None and _met_stop(solution):
+        return (
+            f"{_told_of_step(solution, leaves)}: between knots a joint meets its stop. Keep it "
+            f"away by narrower x_bounds, or give a smaller dt.{_stops(solution)}"
         )
     violations = solution.replays_in(solution.replay_mode).violations.of(solution.best_chain)
     broken = {v.kind for v in violations if v.broken}

@@ -419,14 +419,13 @@ def stalled_of(state: State) -> np.ndarray:
 def optimality(found: Any, chain: int) -> str:
     """What the residual of a chain says, in words; of a `Solution` or a `Minimum`."""
     residual, tolerance = float(found.residual[chain]), found.tolerance
-    if not np.isfinite(residual):
-        return "residual not known"
     if residual < tolerance:
         digits = 1 if float(f"{residual:.1e}") < tolerance else 3  # 9.96e-05 is no 1.0e-04
         return f"residual {residual:.{digits}e}, below {tolerance:g}"
     unfinished = "was interrupted" if found.interrupted else "is unfinished (max_iterations)"
     how = {STALLED: ": the polish stalled", UNFINISHED: f": the polish {unfinished}"}
-    return f"residual {residual:.1e}, above {tolerance:g}{how.get(found.polished[chain], '')}"
+    known = f"{residual:.1e}, above {tolerance:g}" if np.isfinite(residual) else "not known"
+    return f"residual {known}{how.get(found.polished[chain], '')}"
 
 
 def distinct(solution: Results, tolerance: float = TOLERANCE) -> tuple[Optimum, ...]:

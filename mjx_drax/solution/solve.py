@@ -30,7 +30,7 @@ from mjx_drax.search.unlimited import both_of, found_in_steps, is_motion
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.progress import reporting
-from mjx_drax.solution.replay import both_ways, plan_violations
+from mjx_drax.solution.replay import both_ways, hang_on_room, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import (
@@ -39,6 +39,7 @@ from mjx_drax.solution.violations import (
     warn_of_box,
     warn_of_controls_at_the_end,
     warn_of_loose_ends,
+    warn_of_rounding,
 )
 
 
@@ -173,14 +174,18 @@ def solve(
             solution = _certified(problem, settings, seed, found, tolerances)
             if recorder is not None:
                 solution = replace(solution, recording=recorder.recording())
-            best = solution.best_chain
+            best, plans = solution.best_chain, solution.plans.astype(float)
+            given_replays = solution.open_loop, solution.feedback
+            asked = plans, np.asarray(solution.trajectories.u), given_replays, tolerances
+            suspect = hang_on_room(Family.of_one(solution.problem), *asked)[best]
             return Answer(
                 solution,
                 solution.problem,
-                solution.plans[best],
+                plans[best],
                 jax.tree.map(lambda a: a[best], solution.trajectories),
                 float(solution.replay_cost[best]) if solution.certified else math.inf,
                 solution.interrupted or spent[1] >= most or live,
+                bool(solution.certified and suspect),
             )
 
         solution = in_a_fitting_box(problem, solved, warn_of_box, tolerance_of(settings))
@@ -188,7 +193,8 @@ def solve(
         if solution.certified:
             plans, u = solution.plans.astype(float), np.asarray(solution.trajectories.u)
             family = Family.of_one(solution.problem)
-            warn_of_loose_ends(family, plans, u, tolerances, solution.best_chain)
+            for warn in (warn_of_loose_ends, warn_of_rounding):
+                warn(family, plans, u, tolerances, solution.best_chain)
             states, controls = solution.replayed
             warn_of_controls_at_the_end(
                 solution.problem, states[-1], controls[-1], float(solution.times[-1])

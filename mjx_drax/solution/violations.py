@@ -5,8 +5,10 @@ controls, equality and inequality constraints at the stages and at the end, and 
 plan; a replay obeys them). A violation is tolerated up to a number in the user's units that
 `Tolerances` gives, or else up to a share of a scale that is the problem's own, so that units do not
 matter. The scales come from the *extent* E of the planned motion, in each coordinate of states and
-controls the distance between its largest and its least value over the knots. A coordinate that
-hardly moves has the extent `STILL` of the box that initial knots are scattered over.
+controls the distance between its largest and its least value over the knots; or how far it is from
+coasting, where controls are 0 or next to it, if that is less: a satellite that is to move by 1 m is
+not to be judged by its orbit. A coordinate that hardly moves has the extent `STILL` of the box that
+initial knots are scattered over.
 
     kind              scale
     tracking          E
@@ -15,7 +17,9 @@ hardly moves has the extent `STILL` of the box that initial knots are scattered 
                       coordinates at once, for random signs; to first order |E dg/dz|
 
 So a constraint is kept, to first order, if moving the knot by the share of the motion's extent
-could mend it. A stage constraint is one of (x_k, u_k), k = 0..K-1, and x_0 is given.
+could mend it; and not if it is off by more than the share `SPAN` of the largest |g| that there is
+along the motion, or would be if its states came in another order: a stiff contact force changes by
+many times a limit. A stage constraint is one of (x_k, u_k), k = 0..K-1, and x_0 is given.
 """
 
 from __future__ import annotations
@@ -67,6 +71,16 @@ STILL = 1e-2
 WIDE = 10.0
 """A box that is wider than so many times the motion's extent counts as that wide."""
 
+SPAN, LEAST = 0.1, 0.02
+"""Tolerances of constraints are at most the share `SPAN` of the row's largest value, but at least
+`LEAST` of what they would be without this: a row that asks for what holds anyway is always 0."""
+
+NOTABLE = 0.01
+"""What is broken by more than this share of the row's largest value asks for a look at the room."""
+
+ROUNDED = 0.1
+"""Rounding of states above this share of what is tolerated is told."""
+
 FEW = 3
 """So many entries are named."""
 
@@ -77,8 +91,8 @@ MOVE, DIRECTIONS = 1e-2, 16
 """Share of the extent by which knots are moved to see how constraints change, and how often."""
 
 Tolerance = float | Sequence[float] | None
-Limits = tuple[tuple[Array, ...], Array, Array]
-"""Tolerances of each kind in `MEASURED`, the relative one, and `STILL`."""
+Limits = tuple[tuple[Array, ...], Array, Array, Array, Array]
+"""Tolerances of each kind in `MEASURED`, the relative one, `STILL`, `LEAST` and `SPAN`."""
 
 
 @dataclass(frozen=True)
@@ -310,6 +324,26 @@ def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
         return tuple(np.nan_to_num(np.ptp(a, axis=2), posinf=0.0) for a in knots_last)
 
 
+def driven_extents(
+    family: Family, which: np.ndarray, plan: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """`extents` of plans of the problems `which` (n,), or how far they are from coasting."""
+    dynamics = family.problem.dynamics
+    of_x, of_dx, of_u = extents(family.at(0), plan, u)
+    if not dynamics.nx or not len(plan):
+        return of_x, of_dx, of_u
+    alike = family.alone and (plan[:, 0] == plan[0, 0]).all()
+    rows = slice(1) if alike else slice(None)  # all coast alike from one x_0
+    without = np.zeros_like(u[rows])
+    gains = np.zeros((*without.shape, dynamics.ndx))
+    coasting, _ = family.replay(which[rows], plan[rows], without, gains)
+    coasting = np.broadcast_to(coasting, plan.shape)
+    with np.errstate(invalid="ignore", over="ignore"):  # of motions that are not finite
+        off = plan - coasting, family.at(0).dynamics.host_difference(plan, coasting)
+        far = [np.nan_to_num(np.abs(a).max(axis=1), nan=np.inf) for a in off]
+    return np.minimum(of_x, far[0]), np.minimum(of_dx, far[1]), of_u
+
+
 def warn_of_loose_ends(
     family: Family, plan: np.ndarray, u: np.ndarray, tolerances: Tolerances, certified: int
 ) -> None:
@@ -327,13 +361,14 @@ def warn_of_loose_ends(
         return
     still = np.repeat(plan[:, :1], plan.shape[1], axis=1), u
     off = np.zeros((len(plan), family.problem.dynamics.ndx))
-    given = family, still, off, extents(family.problem, plan, u), tolerances
+    extent = driven_extents(family, np.zeros(len(plan), int), plan, u)
+    given = family, still, off, extent, tolerances
     ends = _evaluated(*given)[2]
     for i, kind in enumerate(MEASURED[-2:]):
         off_by, allowed = (a[certified].astype(float) for a in ends[i])
         loose = (off_by > NOTHING * allowed) & (off_by < LOOSE * allowed)
         if loose.any() and (off_by >= LOOSE * allowed).any():
-            of_motion = _evaluated(*given, least=0.0)[2][i][1][certified]
+            of_motion = _evaluated(*given, still=0.0)[2][i][1][certified]
             loose &= off_by >= LOOSE * of_motion
         if loose.any():
             entry = int(np.argmax(loose))
@@ -344,6 +379,31 @@ def warn_of_loose_ends(
                 DraxWarning,
                 stacklevel=3,
             )
+
+
+def warn_of_rounding(
+    family: Family, plan: np.ndarray, u: np.ndarray, tolerances: Tolerances, certified: int
+) -> None:
+    """Warn where states are so far from 0 that their precision shows beside what is tolerated.
+
+    Args are those of `warn_of_loose_ends`.
+    """
+    problem, x = family.problem, np.abs(plan[certified]).max(axis=0, initial=0.0)
+    if problem.precision == 64:
+        return
+    width = np.asarray(scatter_widths(problem)[0])
+    E = driven_extents(family, np.zeros(1, int), plan[[certified]], u[[certified]])[0][0]
+    rounding = np.finfo(np.float32).eps * x
+    coarse = rounding > ROUNDED * tolerances.relative * np.maximum(E, STILL * width)
+    if coarse.any():
+        i = int(np.argmax(coarse))
+        warnings.warn(
+            f"{state_names(problem.dynamics)[i]} is up to {x[i]:.2g}, which float32 knows to "
+            f"{rounding[i]:.1e}, and controls move it by {E[i]:.1e}: solve with precision=64, or "
+            "measure it from nearer.",
+            DraxWarning,
+            stacklevel=3,
+        )
 
 
 def warn_of_controls_at_the_end(
@@ -445,6 +505,27 @@ def measured(
     )
 
 
+def hangs_on_room(
+    family: Family,
+    motion: tuple[np.ndarray, np.ndarray],
+    extent: tuple[np.ndarray, ...],
+    tolerances: Tolerances,
+) -> np.ndarray:
+    """Whether motions break constraints by more than `NOTABLE` of a row's largest value, (n,).
+
+    It is tolerated where a coordinate that the row reads has far more room than it uses: `STILL` of
+    that room is many times what the row asks for. Args are those of `measured`.
+    """
+    off = np.zeros((len(motion[0]), family.problem.dynamics.ndx))
+    size, allowed, *_ = _evaluated(
+        family, motion, off, extent, tolerances, least=0.0, span=NOTABLE
+    )[1]
+    kinds = [kind for kind in MEASURED if "equality" in kind]
+    rows = [MEASURED.index(kind) for kind in kinds]
+    broken: np.ndarray = (size[rows] > allowed[rows]).any(axis=0)
+    return broken
+
+
 def inequalities(
     family: Family,
     motion: tuple[np.ndarray, np.ndarray],
@@ -466,19 +547,21 @@ def _evaluated(
     off: np.ndarray,
     extent: tuple[np.ndarray, ...],
     tolerances: Tolerances,
-    least: float = STILL,
+    still: float = STILL,
+    least: float = LEAST,
+    span: float = SPAN,
 ) -> Any:
-    """What `_measured` returns, on the host but for its last arrays; `least` instead of `STILL`."""
+    """What `_measured` returns, on the host but for its last arrays."""
     with family.problem.arithmetic():
-        given = _on_device(family.at(0), motion, off, extent, tolerances, least)
+        given = _on_device(family.at(0), motion, off, extent, tolerances, still, least, span)
         *found, stages = _measured(*family.parts, *given)
         return *jax.tree.map(np.asarray, found), stages
 
 
 def _on_device(problem: Problem, motion: Any, off: Any, extent: Any, *limits: Any) -> Any:
-    """Arguments of `_measured` and `_by_entry`; limits are tolerances, and `STILL` or less."""
-    tolerances, least = limits
-    every = motion, off, extent, (tolerances.of(problem), tolerances.relative, least)
+    """Arguments of `_measured` and `_by_entry`; limits are tolerances and shares."""
+    tolerances, *shares = limits
+    every = motion, off, extent, (tolerances.of(problem), tolerances.relative, *shares)
     with np.errstate(over="ignore"):  # what is beyond float32 is infinite
         return jax.tree.map(lambda a: jnp.asarray(a, problem.x_init.dtype), every)
 
@@ -538,32 +621,38 @@ def _sizes_and_tolerances(
     limits: Limits,
 ) -> Iterator[tuple[Array, Array, int]]:
     """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
-    given, relative, least = limits
-    E = tuple(map(jnp.maximum, extent, (least * width for width in scatter_widths(problem))))
+    given, relative, still, least, share = limits
+    E = tuple(map(jnp.maximum, extent, (still * width for width in scatter_widths(problem))))
     parts = _sizes_and_scales(problem, *motion, off, E)
-    for (size, scale, first), number in zip(parts, given, strict=True):
-        allowed = jnp.where(jnp.isnan(number), relative * scale, number)
+    for (size, scale, span, first), number in zip(parts, given, strict=True):
+        allowed = relative * scale
+        allowed = jnp.minimum(allowed, jnp.maximum(share * span, least * allowed))
+        allowed = jnp.where(jnp.isnan(number), allowed, number)
         yield size, jnp.broadcast_to(allowed, size.shape), first
 
 
 def _sizes_and_scales(
     problem: Problem, states: Array, u: Array, off: Array, E: tuple[Array, ...]
-) -> Iterator[tuple[Array, Array, int]]:
-    """Sizes (knots, entries), their scales, and the first knot, of each kind in `MEASURED`."""
+) -> Iterator[tuple[Array, Array, Array, int]]:
+    """Sizes (knots, entries), their scales and spans, and the first knot, of kinds in `MEASURED`.
+
+    A span is the largest value of a row, (entries,); infinite for what is no constraint.
+    """
     box, K = problem.bounds, len(u)
     stage, end = problem.constraint, problem.terminal_constraint
-    yield jnp.abs(off)[None], E[1], K
-    yield (*_outside(states[1:], box.x_lower, box.x_upper, E[0]), 1)
-    yield (*_outside(u, box.u_lower, box.u_upper, E[2]), 0)
+    whole = jnp.asarray(jnp.inf)
+    yield jnp.abs(off)[None], E[1], whole, K
+    yield (*_outside(states[1:], box.x_lower, box.x_upper, E[0]), whole, 1)
+    yield (*_outside(u, box.u_lower, box.u_upper, E[2]), whole, 0)
     none = jnp.zeros((K, 0)), jnp.zeros(0)
-    values, changes = none, none
+    values, changes, spans = none, none, none
     if stage.rows or end.rows:
-        values, changes = _constraints(problem, states, u, E)
+        values, changes, spans = _constraints(problem, states, u, E)
     for at, (constraint, first) in enumerate(((stage, 0), (end, K))):
-        value, change = (jnp.atleast_2d(part[at]) for part in (values, changes))
-        m = constraint.equalities
-        yield jnp.abs(value[:, :m]), change[:, :m], first
-        yield jnp.maximum(value[:, m:], 0.0), change[:, m:], first
+        value, change, span = (jnp.atleast_2d(part[at]) for part in (values, changes, spans))
+        span, m = span.max(axis=0), constraint.equalities
+        yield jnp.abs(value[:, :m]), change[:, :m], span[:m], first
+        yield jnp.maximum(value[:, m:], 0.0), change[:, m:], span[m:], first
 
 
 def _outside(z: Array, lower: Array, upper: Array, E: Array) -> tuple[Array, Array]:
@@ -580,27 +669,40 @@ def _outside(z: Array, lower: Array, upper: Array, E: Array) -> tuple[Array, Arr
 
 def _constraints(
     problem: Problem, states: Array, u: Array, E: tuple[Array, ...]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Constraints at the stages (K, m) and at the end (m_end,), and how much they change."""
-    ndx = problem.dynamics.ndx
+) -> tuple[tuple[Array, Array], ...]:
+    """Constraints at the stages (K, m) and at the end (m_end,), how much they change, and spans.
+
+    A span is the largest |g| of a row at a knot, whichever of the states it may have there.
+    """
+    ndx, K = problem.dynamics.ndx, len(u)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (DIRECTIONS, ndx + u.shape[-1]))
     with_none = jnp.asarray(np.vstack([0.0 * signs[:1], signs]), states.dtype)
     steps = with_none * jnp.concatenate([E[1], E[2]]) * MOVE
+    forth = np.arange(K + 1)
+    others = 0 * forth, forth[::-1], np.roll(forth, K // 3), np.roll(forth, -K // 3)
+    orders = np.stack([*[forth] * len(steps), *others])
+    steps = jnp.concatenate([steps, jnp.zeros((len(others), steps.shape[1]), steps.dtype)])
 
-    def values(step: Array) -> tuple[Array, Array]:
-        dx, du = step[:ndx], step[ndx:]
-        moved = jax.vmap(lambda x: problem.dynamics.integrate(x, dx))(states)
+    def values(step: tuple[Array, Array]) -> tuple[Array, Array]:
+        (by, order), move = step, problem.dynamics.integrate
+        dx, du = by[:ndx], by[ndx:]
+        moved = jax.vmap(lambda x: move(x, dx))(states[order])
         knots = problem.knots.at(slice(-1))
         stages = jax.vmap(problem.running_constraint)(moved[:-1], u + du, knots)
         return stages, problem.end_constraint(moved[-1])
 
-    # One after the other: all at once would take sixteen times the memory
-    found = jax.lax.map(values, steps)
+    # One after the other: all at once would take twenty times the memory
+    found = jax.lax.map(values, (steps, jnp.asarray(orders)))
 
     def change(values: Array) -> Array:
-        return jnp.sqrt(jnp.square(jnp.nan_to_num(values[1:] - values[0])).mean(axis=0)) / MOVE
+        changed = values[1 : 1 + DIRECTIONS] - values[0]
+        return jnp.sqrt(jnp.square(jnp.nan_to_num(changed)).mean(axis=0)) / MOVE
 
-    return jax.tree.map(lambda a: a[0], found), jax.tree.map(change, found)
+    def span(values: Array) -> Array:
+        seen = jnp.concatenate([values[:1], values[1 + DIRECTIONS :]])
+        return jnp.abs(jnp.nan_to_num(seen, nan=jnp.inf)).max(axis=0)
+
+    return tuple(jax.tree.map(of, found) for of in (lambda a: a[0], change, span))
 
 
 def _largest(size: Array, allowed: Array, first: int) -> tuple[Array, Array, Array, Array]:
@@ -629,7 +731,7 @@ def by_entry(
         extent: of the plan, from `extents`, without its first axis.
     """
     with problem.arithmetic():
-        given = _on_device(problem, motion, off, extent, tolerances, STILL)
+        given = _on_device(problem, motion, off, extent, tolerances, STILL, LEAST, SPAN)
         found = jax.tree.map(np.asarray, _by_entry(problem, *given))
     return [
         violation

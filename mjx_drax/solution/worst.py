@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjx_drax.problem.problem import Problem
+from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.results import Results
 from mjx_drax.solution.violations import (
@@ -13,8 +14,8 @@ from mjx_drax.solution.violations import (
     Tolerances,
     Violation,
     by_entry,
+    driven_extents,
     entry_name,
-    extents,
     with_plan_tolerance,
     words,
     worst_knots,
@@ -91,7 +92,8 @@ def _motion(
     """The problem, a chain's states x_0..x_K and controls, and their extent."""
     plan = solution.plans[chain].astype(float)
     u = np.asarray(solution.trajectories.u[chain])
-    extent = tuple(each[0] for each in extents(solution.problem, plan[None], u[None]))
+    motion = np.zeros(1, int), plan[None], u[None]
+    extent = tuple(each[0] for each in driven_extents(Family.of_one(solution.problem), *motion))
     return solution.problem, plan, u, extent
 
 

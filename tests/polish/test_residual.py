@@ -25,10 +25,11 @@ def _double():
 
 
 def parts_of(problem, knots, multipliers, v):
-    """The residual: stationarity, defects, constraints, complementarity."""
+    """The residual: stationarity, defects, constraints, complementarity, price."""
     at = problem, LogBarrier(), knots, multipliers, WEIGHTS, Autodiff(), jax.random.key(0)
     found = residual_of(problem, expand(*at), v)[0]
     parts = [found.stationarity, found.defects, found.constraints, found.complementarity]
+    parts.append(found.price)
     assert float(found.total) == max(map(float, parts))
     return np.array(parts)
 
@@ -188,6 +189,16 @@ def test_complementarity_is_a_part_of_its_own():
     assert sizes[1] == pytest.approx(100 * sizes[0], rel=0.05)
     assert nearest([1.2, 0.8], 0.0, 0.3, 0.6)[0] > 1e-2  # forces that do not balance
     assert nearest([1.2, 0.9], 0.0, 0.1, 0.7)[2] > 1e-2  # too far
+
+
+@pytest.mark.slow
+def test_the_price_is_what_the_cost_would_change_by_if_constraints_held():
+    """Relative to what the slope of the cost promises, 0.8 1.2 + 0.2 0.8."""
+    for off in (1e-4, -1e-3):
+        at = nearest([1.2, 0.8 + off], 0.0, 0.2, 0.6)
+        assert at[4] == pytest.approx(0.2 * abs(off) / 1.12, rel=0.02)
+    usual = parts_of(*somewhere(everything()))
+    assert parts_of(*somewhere(everything(wanted=50.0)))[4] > 5 * usual[4]
 
 
 def test_rounding_is_no_motion_where_a_coordinate_has_no_box():

@@ -569,6 +569,10 @@ def test_endless_rate_bounds_ask_for_nothing():
         (lambda model, p: {"body_mass": p["m"]}, r"the model has shape"),
         (lambda model, p: p["n"], "model_numbers failed"),
         (
+            lambda model, p: {"body_gravcomp": model.body_gravcomp + p["m"]},
+            "gives 'body_gravcomp' to what has none .* such as gravcomp=\"1e-6\"",
+        ),
+        (
             lambda model, p: {"opt": model.opt},
             "'opt' of shape None, and the model has no such field",
         ),

@@ -8,7 +8,16 @@ import pytest
 from builders import point, robot
 from jax.tree_util import Partial
 
-from mjx_drax import Langevin, from_function, from_program, minimize, solve, solve_batch, tasks
+from mjx_drax import (
+    Langevin,
+    at_time,
+    from_function,
+    from_program,
+    minimize,
+    solve,
+    solve_batch,
+    tasks,
+)
 from mjx_drax.base.errors import DraxWarning
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.fitting import Answer, is_better, narrowed, widened
@@ -51,6 +60,32 @@ def test_a_box_of_which_something_is_used_stays():
     assert narrowed(one_sided, one_sided, x, u) is None
     by_knot = point(u_bounds=(-1e6 * np.ones((10, 2)), 1e6))
     assert narrowed(by_knot, by_knot, x, u) is None
+
+
+def test_a_suspect_motion_gets_a_box_that_fits_each_of_its_entries():
+    x, u = motion([9.0, 1.0], [2.0, 0.0])
+    used = point(x_bounds=([-1e6, -2.0], [1e6, 2.0]), u_bounds=(-5.0, 5.0))
+    assert narrowed(used, used, x, u) is None
+    problem, which = narrowed(used, used, x, u, each=True)
+    assert which.tolist() == [True, False, False, False]  # what rests, the last, stays
+    np.testing.assert_allclose(boxes(problem)[0][1], [2000.0, 2.0], rtol=1e-6)
+    again, _ = narrowed(used, problem, x, u, each=True)
+    assert boxes(again)[0] == [[-90.0, -2.0], [90.0, 2.0]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wide", "there"), [(1e6, -0.5), (1e8, -0.5), (1e6, 8.0)])
+def test_bounds_that_mean_none_do_not_make_anything_feasible(wide, there):
+    problem = from_function(
+        lambda x, u: x + 0.05 * jnp.stack([x[1], u[0]]), x_init=[0.0, 0.0], nu=1, dt=0.05,
+        horizon=2.0, running_residual=lambda x, u: 0.05 * u,
+        terminal_residual=lambda x: x[1:] - 5.0, u_bounds=(-20.0, 20.0),
+        x_bounds=([-wide, -5.0], [wide, 5.0]), equality=at_time(lambda x, u: x[:1] - there, 1.0),
+    )  # fmt: skip
+    found = solve(problem, chains=4)
+    assert found.certified == (there < 5.0)  # no motion gets further in a second
+    if found.certified:
+        assert found.replayed[0][20, 0] == pytest.approx(there, abs=0.05)
 
 
 def test_where_no_bound_is_a_box_is_narrower_if_nothing_uses_it():

@@ -47,6 +47,12 @@ def test_a_wall_that_is_jumped_between_two_knots_is_told():
     )
 
 
+def test_a_wall_that_is_jumped_after_the_last_stage_is_told():
+    broken = broken_between_knots(gliding(inequality=wall(0.95)), 0)
+    assert (broken.entry, broken.knot) == (1, 9)
+    assert broken.size == pytest.approx(0.03, abs=1e-6)
+
+
 def test_of_several_the_one_that_is_broken_most_by_its_tolerance_is_told():
     def two(data, u):
         wall_in_mm = 30.0 - 1e3 * jnp.abs(data.qpos[0] - 0.55)
@@ -65,16 +71,22 @@ def once(data, u, knot):
     return jnp.where(knot.index == 5, data.qpos - 0.52, -1.0)
 
 
+def at_last(data, u, knot):
+    """The sled is not past 0.92 m at the last stage."""
+    return jnp.where(knot.index == 9, data.qpos - 0.92, -1.0)
+
+
 @pytest.mark.parametrize(
     "given",
     [
         {"inequality": wall(2.0)},
         {"inequality": once},
+        {"inequality": at_last},
         {"inequality": wall(0.55), "dt": 0.01},
         {"inequality": wall(0.55), "rates": 1},
         {},
     ],
-    ids=["elsewhere", "once", "every-step", "rates", "none"],
+    ids=["elsewhere", "once", "at-last", "every-step", "rates", "none"],
 )
 def test_nothing_else_is_told(given):
     assert broken_between_knots(gliding(**given), 0) is None

@@ -34,6 +34,7 @@ from mjx_drax.solution.violations import (
     most_broken,
     warn_of_controls_at_the_end,
     warn_of_loose_ends,
+    warn_of_rounding,
     worst_knots,
 )
 from mjx_drax.view import plotting
@@ -435,7 +436,13 @@ def test_a_plan_that_its_replay_does_not_follow_is_not_called_optimal():
 
 @pytest.mark.parametrize(
     ("place", "tolerated", "warned"),
-    [(1e-4, None, True), (0.1, None, False), (0.1, 0.09, True), (1e-4, 1e-6, False), (0, 1, False)],
+    [
+        (1e-4, None, False),
+        (0.1, None, False),
+        (0.1, 0.09, True),
+        (1e-4, 1e-6, False),
+        (0, 1, False),
+    ],
     ids=["short", "far", "far-but-tolerated", "short-but-strict", "stays"],
 )
 def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, warned):
@@ -453,13 +460,21 @@ def test_an_end_that_asks_less_than_is_tolerated_is_warned_of(place, tolerated, 
 @pytest.mark.parametrize(
     ("far", "moves", "start", "warned"),
     [
-        (1e-5, 2e-6, None, True),
+        (1e-6, 2e-7, None, True),
+        (1e-5, 2e-6, None, False),
         (1e-5, 2e-6, ([0.0, -1.0], [0.0, 1.0]), False),
         (1e-5, 0.5, None, False),
         (0.5, 0.5, None, False),
         (0.0, 0.0, None, False),
     ],
-    ids=["fine-axis", "chosen-start", "ends-near-its-start", "far", "stays"],
+    ids=[
+        "beyond-what-is-told-apart",
+        "fine-axis",
+        "chosen-start",
+        "ends-near-its-start",
+        "far",
+        "stays",
+    ],
 )
 def test_an_entry_that_asks_less_than_the_box_lets_it_is_warned_of(far, moves, start, warned):
     def step(x, u):
@@ -477,6 +492,42 @@ def test_an_entry_that_asks_less_than_the_box_lets_it_is_warned_of(far, moves, s
         warn_of_loose_ends(Family.of_one(gantry), x, u, Tolerances(), 0)
     told = [f"terminal equality [1] by {far:.1e}" in str(w.message) for w in found]
     assert told == [True] * warned
+
+
+def test_what_moves_by_itself_is_judged_by_what_controls_change():
+    """A mass that drifts by 1000 and is to be 1 further; and one at rest, moved by 1."""
+    drifts = mass(x_init=[0.0, 1000.0 / (K * DT)], terminal_equality=lambda x: x[:1] - 1001.0)
+    x, u = motion(1.0 / motion()[0][-1, 0])
+    drift = np.outer(DT * np.arange(K + 1), [1000.0 / (K * DT), 0.0])
+    drift[:, 1] = 1000.0 / (K * DT)
+    moving = replayed(drifts, x + drift, u).violations
+    still = replayed(mass(terminal_equality=lambda x: x[:1] - 1.0), x, u).violations
+    at = KINDS.index("terminal_equality")
+    assert moving.allowed[0, at] == pytest.approx(still.allowed[0, at], rel=1e-2)
+    assert moving.allowed[0, at] < 0.01
+
+
+def test_a_row_is_not_kept_if_it_is_off_by_a_tenth_of_all_that_it_ever_is():
+    """As a stiff contact: it changes by thousands where a knot moves, and asks for 12 or less."""
+    stiff = mass(inequality=lambda x, u: 20.0 * jnp.tanh(1e3 * (x[:1] - 0.5)) - 12.0)
+    x, u = motion(1.0 / motion()[0][-1, 0])
+    found = replayed(stiff, x, u).violations
+    at = KINDS.index("inequality")
+    assert found.size[0, at] == pytest.approx(8.0, abs=0.1)
+    assert found.allowed[0, at] <= 3.3  # of 32
+
+
+def test_where_float32_knows_states_too_coarsely_is_told():
+    x, u = motion()
+    far = x + np.array([1e5, 0.0])
+    for there, told in ((x, []), (far, ["x0 is up to 1e+05, which float32 knows to 1.2e-02"])):
+        problem = mass(x_init=there[0], x_scatter=(there[0] - 1.0, there[0] + 1.0))
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            warn_of_rounding(Family.of_one(problem), there[None], u[None], Tolerances(), 0)
+        assert [str(w.message).partition(",")[0] for w in found] == [
+            words.partition(",")[0] for words in told
+        ]
 
 
 def test_of_violations_without_a_tolerance_the_largest_is_told():
