@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_drax.base.errors import DraxError
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
@@ -129,11 +130,16 @@ def followed(
     better = open_loop_is_better(open_loop, feedback)
     states = np.where(better[:, None, None], open_loop.states, feedback.states)
     replayed = np.where(better, open_loop.cost, feedback.cost)
-    with problem.arithmetic():
-        least = STILL * np.asarray(scatter_widths(problem)[1])
     with np.errstate(invalid="ignore"):  # of plans that are not finite
-        off = np.abs(problem.dynamics.host_difference(states, plan)).max(axis=1, initial=0.0)
-        moves = np.maximum(extents(problem, plan, open_loop.controls)[1], least)
+        try:
+            away, which = problem.dynamics.host_difference(states, plan), 1
+            moves = extents(problem, plan, open_loop.controls)[which]
+        except DraxError:  # of a user's own states, which are not known where this is loaded
+            away, which = states - plan, 0
+            moves = np.ptp(plan, axis=1)
+        with problem.arithmetic():
+            moves = np.maximum(moves, STILL * np.asarray(scatter_widths(problem)[which]))
+        off = np.abs(away).max(axis=1, initial=0.0)
         most = np.maximum(np.abs(cost), np.abs(replayed))
         alike: np.ndarray = np.abs(replayed - cost) <= FOLLOWED * most
     return (off <= FOLLOWED * moves).all(axis=1) | alike

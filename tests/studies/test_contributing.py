@@ -259,7 +259,7 @@ def test_names_that_lead_nowhere_are_named(mine, tmp_path, monkeypatch):
     for text, words in (
         ("my_absent:Own", "'my_absent:Own' cannot be imported: ModuleNotFoundError"),
         (f"{MODULE}:Absent", "has no attribute 'Absent'"),
-        (f"{MODULE}:Approach", "give one of BFGS, Diagonal, .*, or MODULE:CLASS"),
+        (f"{MODULE}:Approach", "give one of .*Diagonal, .*, or MODULE:CLASS"),
     ):
         with pytest.raises(DraxError, match=words):
             changed(SOLVER, "flow.preconditioner", text)
