@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike
 from mjx_drax.base.errors import DraxError, DraxWarning, is_number, require_whole, shown
 from mjx_drax.base.numbers import numbers, vector
 from mjx_drax.base.pytrees import Static, register_dataclass
-from mjx_drax.problem.cost import as_partial, takes_knot
+from mjx_drax.problem.cost import Constraint, as_partial, takes_knot
 from mjx_drax.problem.dynamics import Dynamics
 from mjx_drax.problem.extended import Extended, Seen, with_knot
 from mjx_drax.problem.trajectory import Box
@@ -273,6 +274,12 @@ class Rates:
         own = [] if self.inequality is None else [jnp.ravel(self.inequality(seen, u))]
         rows = rate[above] - self.upper[above], self.lower[below] - rate[below]
         return jnp.concatenate([*own, *rows])
+
+
+def rated_controls(constraint: Constraint) -> list[int]:
+    """The controls whose rates the last rows of the inequality bound, one for each row."""
+    parts = jax.tree.leaves(constraint.inequality, is_leaf=lambda part: isinstance(part, Rates))
+    return [i for part in parts if isinstance(part, Rates) for i in (*part.above, *part.below)]
 
 
 def _with_rates(rates: Pair, inequality: Any, nu: int) -> Any:

@@ -16,6 +16,7 @@ import sysconfig
 import traceback
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,8 @@ def _jaxpr(
         else:
             given = " and ".join(map(_kind, arguments))
             missing = _missing(function) if "NoneType" in str(error) else ""
-            way = missing or f"Change it: it is called with {count}, {given}"
+            known = _names(function, arguments) if isinstance(error, KeyError) else ""
+            way = missing or f"Change it: {known}it is called with {count}, {given}"
         said = f"{plain(error)}{_place(error)}"
         raise DraxError(f"{label} failed when it was traced: {said}. {way}.") from error
 
@@ -152,6 +154,17 @@ def _missing(function: Any) -> str:
     none = [name for name in read if getattr(knot, name, None) is None]
     asked = " or ".join(f"{_ASKED_BY[name]} for knot.{name}" for name in none)
     return asked and f"Give {asked}: else it is None"
+
+
+def _names(function: Any, arguments: Arguments) -> str:
+    """The names of parameters and data that a function could read; nothing if there are none."""
+    knots = [_knot_of(function), *(getattr(given, "knot", None) for given in arguments)]
+    known = {}
+    for part, knot in product(("parameters", "data"), knots):
+        has = getattr(knot, part, None)
+        if isinstance(has, dict) and has:
+            known[part] = f"knot.{part} has {', '.join(map(repr, has))}"
+    return "".join(f"{names}, and " for names in known.values())
 
 
 def _knot_of(function: Any) -> Any:

@@ -218,18 +218,15 @@ def _between_knots(solution: Results) -> str:
 
 
 def _unplanned_contact(solution: Results) -> str:
-    """What there is to say where a replay has a contact that constraints do not see."""
-    problem = solution.problem
-    if problem.constraint.rows + problem.terminal_constraint.rows == 0:
-        return ""
-    found = problem.dynamics.left_out(solution.replayed[0])
+    """What there is to say where a replay has a contact that costs and constraints do not see."""
+    found = solution.problem.dynamics.left_out(solution.replayed[0])
     if found is None:
         return ""
     knot, contact = found
     return (
         f"when replayed {contact} at knot {knot}, {solution.times[knot]:.2f} s: the plan has no "
-        "contacts of these two, and constraints that read contact forces do not see them. Add the "
-        "pair to contacts= if any does"
+        "contacts of these two, and costs and constraints that read forces or accelerations do not "
+        "see them. Add the pair to contacts= if any does"
     )
 
 

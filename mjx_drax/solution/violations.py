@@ -42,6 +42,7 @@ from mjx_drax.kernels.linalg import full_precision
 from mjx_drax.kernels.pruning import needed_program
 from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.physics.engine import mujoco
+from mjx_drax.problem.choices import rated_controls
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
@@ -245,7 +246,14 @@ def entry_name(problem: Problem, kind: str, entry: int) -> str:
         return control_names(dynamics)[entry]
     if kind == "state_bounds":
         return state_names(dynamics)[entry]
-    return difference_names(dynamics)[entry] if kind in (TRACKING, DYNAMICS) else f"[{entry}]"
+    if kind in (TRACKING, DYNAMICS):
+        return difference_names(dynamics)[entry]
+    if kind == INEQUALITY and problem.constraint.further is None:
+        rated = rated_controls(problem.constraint)
+        row = entry - problem.constraint.inequalities + len(rated)
+        if row >= 0 and rated:
+            return f"[rate of {control_names(dynamics)[rated[row]]}]"
+    return f"[{entry}]"
 
 
 @dataclass(frozen=True)

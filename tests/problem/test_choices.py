@@ -32,6 +32,7 @@ from mjx_drax.base.errors import DraxWarning
 from mjx_drax.physics.c_engine import stepper
 from mjx_drax.physics.dynamics import mujoco_model
 from mjx_drax.solution.names import state_names
+from mjx_drax.solution.violations import entry_name
 
 
 @pytest.mark.slow
@@ -531,6 +532,13 @@ def test_the_brachistochrone_and_the_fastest_swing_up():
         ({"x_init_bounds": (1.0, 2.0)}, "lies outside of x_init_bounds"),
         ({"x_init_bounds": (np.zeros(3), np.ones(3))}, "x_init_bounds are"),
         ({"rates": 3}, "rates is 3"),
+        (
+            {
+                "parameters": {"mass": (1, 2)},
+                "running_cost": lambda x, u, knot: knot.parameters["m"],
+            },
+            "KeyError: 'm'.* Change it: knot.parameters has 'mass'",
+        ),
         ({"rate_bounds": (1.0, -1.0)}, "rate_bounds are"),
         ({"u_init": [0.0]}, "nothing reads a rate"),
         ({"rates": 1, "u_init": [0.0, 1.0]}, "u_init has shape"),
@@ -555,6 +563,13 @@ def test_functions_may_hold_random_keys():
         running_cost=lambda x, u: (u[0] - jax.random.uniform(key)) ** 2,
     )
     assert noise.horizon == 3
+
+
+def test_rows_on_rates_are_called_so():
+    problem = fastest(rate_bounds=(-9.0, 9.0), inequality=lambda x, u: x[:1] - 5.0)
+    names = [entry_name(problem, "inequality", i) for i in range(3)]
+    assert names == ["[0]", "[rate of u0]", "[rate of u0]"]
+    assert entry_name(problem, "equality", 0) == "[0]"
 
 
 def test_endless_rate_bounds_ask_for_nothing():
