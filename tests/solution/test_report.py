@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 from builders import BALL, arm, made_up, point, robot
 
-from mjx_drax import DraxError, Restarts, Solution, from_program, minimize, solve_batch
+from mjx_drax import (
+    DraxError,
+    Restarts,
+    Solution,
+    from_mjcf,
+    from_program,
+    minimize,
+    solve_batch,
+)
+from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
 from mjx_drax.solution import report
 from mjx_drax.solution.names import difference_names
@@ -219,6 +228,31 @@ def test_the_advice_where_the_plan_lacks_a_contact(monkeypatch):
     told = (2, "'floor' touches 'shin'")
     monkeypatch.setattr(type(solution.problem.dynamics), "left_out", lambda self, states: told)
     assert "at knot 2, 0.04 s, 'floor' touches 'shin', and the plan" in str(solution)
+
+
+@pytest.mark.parametrize("rates", [{}, {"rates": 1}], ids=["plain", "extended"])
+def test_the_advice_where_a_joint_meets_its_stop_between_two_knots(rates):
+    """Its motor throws it back at 0.98 m, 5 cm before its stop or 1 cm behind it."""
+    for end, met in ((1.03, False), (0.97, True)):
+        text = f"""<mujoco><option timestep="0.005"/><worldbody><body>
+          <joint name="slide" type="slide" axis="1 0 0" range="-9 {end}"/>
+          <geom size=".1" mass="1"/></body></worldbody>
+          <actuator><motor joint="slide"/></actuator></mujoco>"""
+        x = np.array([[0.9, 8.0], *([0.86 - 0.4 * k, -8.0] for k in range(4))], np.float32)
+        u = np.array([[-320.0], [0.0], [0.0], [0.0]], np.float32)
+        problem = from_mjcf(
+            text, horizon=0.2, dt=0.05, x_init=x[0], running_residual=lambda data, u: u, **rates
+        )
+        made = made_up(problem, 1)
+        rest = problem.dynamics.nx - 2
+        knots = np.concatenate([x[1:], np.zeros((4, rest), np.float32)], axis=1)
+        if rest:
+            knots[:, 2:] = u
+        plan = replace(made, trajectories=Trajectory(knots[None], u[None])).certify()
+        told = str(replace(plan, max_defect=made.max_defect)).splitlines()[-1]
+        assert ("between knots a joint meets its stop" in told) == met
+        assert ("at knot 0, 0 s, a step of MuJoCo ends" in told) == met
+        assert (told == "CERTIFIED, not known to be optimal") != met
 
 
 def test_one_motion_of_one_chain_or_of_several():
