@@ -28,9 +28,10 @@ from mjx_drax.base.pytrees import register_dataclass
 from mjx_drax.method.model import Multipliers
 from mjx_drax.problem.dynamics import FunctionDynamics
 from mjx_drax.problem.trajectory import Stagewise
+from mjx_drax.search.family import Family
 from mjx_drax.solution.export import NothingToExport
-from mjx_drax.solution.replay import Replays
-from mjx_drax.solution.violations import KINDS, Tolerances, Violations
+from mjx_drax.solution.replay import Replays, judged
+from mjx_drax.solution.violations import KINDS, Tolerances, Violations, driven_extents
 
 INF, NAN = math.inf, math.nan
 
@@ -150,6 +151,16 @@ def bouncing(kinked=Bouncing):
     if kinked is None:
         return from_function(ball, nu=1, dt=0.05, **rest)
     return from_dynamics(kinked(Partial(ball), 0.05, 2, 1), **rest)
+
+
+def replays(problem, trajectories, gains, tolerances=None):
+    """Every chain's controls, applied from x_0 with the given feedback gains, and judged."""
+    with problem.arithmetic():
+        plan = np.asarray(problem.with_start(trajectories), float)
+    u = np.asarray(trajectories.u)
+    family, ran = Family.of_one(problem), problem.replay(plan, u, gains)
+    extent = driven_extents(family, np.zeros(len(u), int), plan, u)
+    return judged(family, plan, extent, ran, tolerances or Tolerances())
 
 
 def made_up(problem, chains=2):

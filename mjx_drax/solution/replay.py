@@ -19,7 +19,6 @@ import numpy as np
 
 from mjx_drax.base.errors import DraxError
 from mjx_drax.problem.problem import Problem
-from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.violations import (
@@ -33,8 +32,8 @@ from mjx_drax.solution.violations import (
     Violations,
     driven_extents,
     extents,
-    hangs_on_room,
     measured,
+    notably_broken,
     scatter_widths,
 )
 
@@ -145,22 +144,6 @@ def followed(
     return (off <= FOLLOWED * moves).all(axis=1) | alike
 
 
-def replays(
-    problem: Problem,
-    trajectories: Trajectory,
-    gains: np.ndarray,
-    tolerances: Tolerances | None = None,
-) -> Replays:
-    """Every chain's controls, applied from x_0 with the given feedback gains."""
-    with problem.arithmetic():
-        plan = np.asarray(problem.with_start(trajectories), float)
-    u = np.asarray(trajectories.u)
-    ran = problem.replay(plan, u, gains)
-    family = Family.of_one(problem)
-    extent = driven_extents(family, np.zeros(len(u), int), plan, u)
-    return judged(family, plan, extent, ran, tolerances or Tolerances())
-
-
 def both_ways(
     family: Family, plan: np.ndarray, u: np.ndarray, gains: np.ndarray, tolerances: Tolerances
 ) -> tuple[Replays, Replays, np.ndarray]:
@@ -187,7 +170,7 @@ def hang_on_room(
     replays: tuple[Replays, Replays],
     tolerances: Tolerances,
 ) -> np.ndarray:
-    """Whether the better replays `hangs_on_room`, (n,): they may keep constraints for it alone.
+    """Whether the better replays are `notably_broken`, (n,), and tolerated for much room alone.
 
     Args are those of `both_ways`, and its replays, open loop and with feedback.
     """
@@ -201,7 +184,7 @@ def hang_on_room(
         np.where(better, open_loop.controls, feedback.controls),
     )
     extent = driven_extents(family, np.resize(np.arange(family.count), len(u)), plan, u)
-    return hangs_on_room(family, ran, extent, tolerances)
+    return notably_broken(family, ran, extent, tolerances)
 
 
 def judged(

@@ -20,7 +20,7 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Progress, Search
 from mjx_drax.search.family import Family
-from mjx_drax.search.fitting import Answer, in_a_fitting_box
+from mjx_drax.search.fitting import Answer, in_a_fitting_box, narrowed
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
@@ -134,7 +134,7 @@ def solve(
 
         most = math.inf if max_seconds is None else max_seconds
 
-        spent = [0.0, 0.0]  # compiling and solving
+        spent, whole = [0.0, 0.0], problem  # compiling and solving; in the user's box
         live = record is not None and type(record) is not Recorder  # it shows one solve
 
         def solved(problem: Problem) -> Answer[Solution]:
@@ -175,17 +175,20 @@ def solve(
             if recorder is not None:
                 solution = replace(solution, recording=recorder.recording())
             best, plans = solution.best_chain, solution.plans.astype(float)
-            given_replays = solution.open_loop, solution.feedback
-            asked = plans, np.asarray(solution.trajectories.u), given_replays, tolerances
-            suspect = hang_on_room(Family.of_one(solution.problem), *asked)[best]
+            knots = jax.tree.map(lambda a: a[best], solution.trajectories)
+            suspect, posed = False, solution.problem
+            if solution.certified and narrowed(whole, posed, plans[best], knots.u, each=True):
+                both_replays = solution.open_loop, solution.feedback
+                asked = plans, np.asarray(solution.trajectories.u), both_replays, tolerances
+                suspect = bool(hang_on_room(Family.of_one(posed), *asked)[best])
             return Answer(
                 solution,
-                solution.problem,
+                posed,
                 plans[best],
-                jax.tree.map(lambda a: a[best], solution.trajectories),
+                knots,
                 float(solution.replay_cost[best]) if solution.certified else math.inf,
                 solution.interrupted or spent[1] >= most or live,
-                bool(solution.certified and suspect),
+                suspect,
             )
 
         solution = in_a_fitting_box(problem, solved, warn_of_box, tolerance_of(settings))

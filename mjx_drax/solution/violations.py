@@ -513,7 +513,7 @@ def measured(
     )
 
 
-def hangs_on_room(
+def notably_broken(
     family: Family,
     motion: tuple[np.ndarray, np.ndarray],
     extent: tuple[np.ndarray, ...],

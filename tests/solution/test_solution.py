@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from builders import Bouncing, bouncing, made_up, point
+from builders import Bouncing, bouncing, made_up, point, replays
 from jax.tree_util import Partial
 
 from mjx_drax import (
@@ -24,7 +24,6 @@ from mjx_drax.search.engine import REPORT_EVERY
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import evaluate, iterate
 from mjx_drax.solution import solution as solutions
-from mjx_drax.solution.replay import replays
 from mjx_drax.solution.solve import solve
 from mjx_drax.tasks import load
 

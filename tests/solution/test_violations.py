@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders import made_up, point
+from builders import made_up, point, replays
 from jax.tree_util import Partial
 
 from mjx_drax import (
@@ -26,7 +26,7 @@ from mjx_drax.problem.problem import Problem
 from mjx_drax.search.family import Family
 from mjx_drax.search.iterate import FEASIBLE
 from mjx_drax.solution.program import from_program
-from mjx_drax.solution.replay import followed, open_loop_is_better, replays
+from mjx_drax.solution.replay import followed, open_loop_is_better
 from mjx_drax.solution.report import lines
 from mjx_drax.solution.violations import (
     KINDS,
