@@ -43,6 +43,7 @@ from mjx_drax.kernels.pruning import needed_program
 from mjx_drax.physics.dynamics import mjx_dynamics
 from mjx_drax.physics.engine import mujoco
 from mjx_drax.problem.choices import rated_controls
+from mjx_drax.problem.extended import Extended
 from mjx_drax.problem.problem import Problem
 from mjx_drax.problem.trajectory import Trajectory
 from mjx_drax.search.family import Family
@@ -335,16 +336,23 @@ def extents(problem: Problem, plan: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
 def driven_extents(
     family: Family, which: np.ndarray, plan: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """`extents` of plans of the problems `which` (n,), or how far they are from coasting."""
+    """`extents` of plans of the problems `which` (n,), or how far they are from coasting.
+
+    Where x_0 is free it is a choice, as controls are: coasting begins at x_init.
+    """
     dynamics = family.problem.dynamics
     of_x, of_dx, of_u = extents(family.at(0), plan, u)
     if not dynamics.nx or not len(plan):
         return of_x, of_dx, of_u
-    alike = family.alone and (plan[:, 0] == plan[0, 0]).all()
+    begin, chosen = plan[:, :1].copy(), dynamics.nx if family.problem.free else 0
+    if isinstance(dynamics, Extended):  # parameters and durations stay as they are chosen
+        chosen = dynamics.inner.nx + dynamics.sizes.w if dynamics.sizes.w else 0
+    begin[:, 0, :chosen] = np.asarray(family.rows(which, 1).x_init)[..., :chosen]
+    alike = family.alone and (begin == begin[0]).all()
     rows = slice(1) if alike else slice(None)  # all coast alike from one x_0
     without = np.zeros_like(u[rows])
     gains = np.zeros((*without.shape, dynamics.ndx))
-    coasting, _ = family.replay(which[rows], plan[rows], without, gains)
+    coasting, _ = family.replay(which[rows], begin[rows].repeat(plan.shape[1], 1), without, gains)
     coasting = np.broadcast_to(coasting, plan.shape)
     with np.errstate(invalid="ignore", over="ignore"):  # of motions that are not finite
         off = plan - coasting, family.at(0).dynamics.host_difference(plan, coasting)

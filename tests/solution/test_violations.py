@@ -31,6 +31,7 @@ from mjx_drax.solution.report import lines
 from mjx_drax.solution.violations import (
     KINDS,
     Violation,
+    driven_extents,
     most_broken,
     warn_of_controls_at_the_end,
     warn_of_loose_ends,
@@ -505,6 +506,17 @@ def test_what_moves_by_itself_is_judged_by_what_controls_change():
     at = KINDS.index("terminal_equality")
     assert moving.allowed[0, at] == pytest.approx(still.allowed[0, at], rel=1e-2)
     assert moving.allowed[0, at] < 0.01
+
+
+def test_where_the_start_is_chosen_it_is_no_coasting():
+    """A mass that is thrown, and then left alone; its velocity is what is chosen."""
+    thrown = mass(terminal_equality=lambda x: x[:1] - 5.0, x_init_bounds=([0, -9], [0, 9]))
+    x = np.outer(DT * np.arange(K + 1), [5.0 / (K * DT), 0.0])
+    x[:, 1] = 5.0 / (K * DT)
+    nx = thrown.dynamics.nx
+    plan = np.concatenate([x, np.repeat([[x[0, 1]]], K + 1, axis=0)], axis=1)[None, :, :nx]
+    of_x, *_ = driven_extents(Family.of_one(thrown), np.zeros(1, int), plan, np.zeros((1, K, 1)))
+    assert of_x[0, 0] == pytest.approx(5.0)
 
 
 def test_a_row_is_not_kept_if_it_is_off_by_a_tenth_of_all_that_it_ever_is():
