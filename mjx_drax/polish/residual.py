@@ -7,8 +7,8 @@ With the Lagrangian L = c + lambda'h - v_l'(z - z_L) - v_u'(z_U - z), a local op
     defects             h = 0             relative to how far each coordinate of the state moves
     constraints         r = 0             relative to what a row changes by as everything moves
     complementarity     v slack = 0       summed over all bounds, relative to the cost
-    price               lambda'h = 0      relative to the cost, of which this is what is amiss, to
-                                          first order, for what is left of defects and constraints
+    price               lambda'h = 0      relative to PRICED times the cost, of which this is what
+                                          is amiss, to first order, for what is left of h
 
 and the residual is the largest of the five. How far a coordinate moves is measured from x_init, and
 from 0 for controls; it counts as at least a hundredth of the box that initial knots are drawn from,
@@ -46,6 +46,9 @@ STILL = 1e-3
 STATES = 0.05
 """Share of the states' slopes in the cost's size: where terminal weights are large, they promise
 many times what the cost is."""
+
+PRICED = 3.0
+"""So many times as large as other parts the price may be: float32 can often not get nearer."""
 
 REST = 1e-2
 """Share of the box of initial knots that a coordinate moves by at least."""
@@ -142,7 +145,7 @@ def residual_of(problem: Problem, model: Model, v: Sides) -> tuple[Residual, Sca
     prices = [model.h.dynamics * multipliers.dynamics]
     prices += jax.tree.leaves(jax.tree.map(jnp.multiply, r, multipliers.constraints))
     forces = jnp.max(jnp.stack([jnp.abs(part).max(initial=0.0) for part in prices]))
-    price = jnp.abs(sum(jnp.sum(part) for part in prices)) / cost
+    price = jnp.abs(sum(jnp.sum(part) for part in prices)) / (PRICED * cost)
     slopes = (jnp.abs(dual.x) * x).max(initial=0.0), (jnp.abs(dual.u) * u).max(initial=0.0)
     error = jnp.maximum(forces, jnp.maximum(*slopes))
     if model.start is not None:

@@ -50,7 +50,6 @@ class Answer(Generic[Found]):
         x: planned states x_0..x_K of the best chain, (K + 1, nx).
         knots: of that.
         cost: of that; infinite if it is not feasible, or not certified.
-        suspect: whether it may keep its constraints for no reason but that there is much room.
         last: whether no other solve may follow.
     """
 
@@ -60,7 +59,6 @@ class Answer(Generic[Found]):
     knots: Trajectory
     cost: float
     last: bool
-    suspect: bool = False
 
 
 def in_a_fitting_box(
@@ -85,18 +83,16 @@ def in_a_fitting_box(
     for _ in range(BOXES):
         if answer.last:
             break
-        motion = answer.x, answer.knots.u
-        how, fitting = NARROWER, narrowed(given, problem, *motion, each=answer.suspect)
+        how, fitting = NARROWER, narrowed(given, problem, answer.x, answer.knots.u)
         if fitting is None and not np.isfinite(answer.cost):
-            how, fitting = WIDER, widened(problem, *motion)
+            how, fitting = WIDER, widened(problem, answer.x, answer.knots.u)
         if fitting is None:
             break
         problem, which = fitting
         other = solved(problem)
-        if is_better(answer, other, tolerance):
-            answer, others[how] = other, others[how] | which
-        elif not answer.suspect:
+        if not is_better(answer, other, tolerance):
             break
+        answer, others[how] = other, others[how] | which
     for how, which in others.items():
         if which.any():
             told(given, which, how)
@@ -104,7 +100,7 @@ def in_a_fitting_box(
 
 
 def narrowed(
-    given: Problem, problem: Problem, x: np.ndarray, u: ArrayLike, each: bool = False
+    given: Problem, problem: Problem, x: np.ndarray, u: ArrayLike
 ) -> tuple[Problem, np.ndarray] | None:
     """The problem with a box of initial knots that fits a motion; None if its own does.
 
@@ -117,13 +113,11 @@ def narrowed(
         problem: the same, whose box may be narrower by now. Where f has kinks it stays: nothing is
             optimal there, and much of a robot stands still.
         x, u: states x_0..x_K (K + 1, nx) and controls (K, nu).
-        each: whether every bounded entry that moves, and uses less of its room, gets other sides,
-            whatever the others do and f has.
 
     Returns:
         It, and which entries of [x, u] have other sides, (nx + nu,).
     """
-    if problem.dynamics.kinked and not each:
+    if problem.dynamics.kinked:
         return None
     chosen = []
     for part in _parts(problem, x, u):
@@ -131,12 +125,10 @@ def narrowed(
         width, extent = part.box[1] - part.box[0], part.extent
         bounded = np.isfinite(part.bounds).all(axis=0) & (part.bounds == first).all(axis=0)
         free, little = part.free, extent < REST * width
-        alone = bounded & little
-        wide = alone & (alone == bounded).all()
+        wide = bounded & little
+        wide &= (wide == bounded).all()
         if (little | ~(bounded | free)).all() and extent.any():
             wide |= free
-        if each:
-            wide |= alone & (extent > 0.0)
         chosen.append((part, wide, np.maximum(AROUND * extent, LEAST * width)))
     return _with_reaches(problem, chosen)
 

@@ -37,7 +37,6 @@ from mjx_drax.solution.replay import (
     Replays,
     both_ways,
     followed,
-    hang_on_room,
     largest_defect,
     open_loop_is_better,
     plan_violations,
@@ -305,9 +304,7 @@ def _certified(
     open_loop, feedback, gains = both_ways(family, plan, u, gains, tolerances)
     one = family.at(0)
     moves = (plan - plan[:, :1]).reshape(-1, plan.shape[2])  # the first is 0
-    suspect = hang_on_room(family, plan, u, (open_loop, feedback), tolerances)
-    each = bool((suspect & (open_loop.success | feedback.success)).any())
-    wide = narrowed(one, one, moves, u.reshape(-1, u.shape[2]), each)
+    wide = narrowed(one, one, moves, u.reshape(-1, u.shape[2]))
     if wide is not None:
         warn_of_box(one, wide[1])
     return BatchSolution(

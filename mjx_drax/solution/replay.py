@@ -33,7 +33,6 @@ from mjx_drax.solution.violations import (
     driven_extents,
     extents,
     measured,
-    notably_broken,
     scatter_widths,
 )
 
@@ -161,30 +160,6 @@ def both_ways(
     found = family.tracked(which, plan, u, gains)
     feedback = judged(family, plan, extent, (found.states, found.controls), tolerances)
     return judged(family, plan, extent, open_loop, tolerances), feedback, found.gains
-
-
-def hang_on_room(
-    family: Family,
-    plan: np.ndarray,
-    u: np.ndarray,
-    replays: tuple[Replays, Replays],
-    tolerances: Tolerances,
-) -> np.ndarray:
-    """Whether the better replays are `notably_broken`, (n,), and tolerated for much room alone.
-
-    Args are those of `both_ways`, and its replays, open loop and with feedback.
-    """
-    problem = family.problem
-    if not problem.constraint.rows + problem.terminal_constraint.rows:
-        return np.zeros(len(u), bool)
-    better = open_loop_is_better(*replays)[:, None, None]
-    open_loop, feedback = replays
-    ran = (
-        np.where(better, open_loop.states, feedback.states),
-        np.where(better, open_loop.controls, feedback.controls),
-    )
-    extent = driven_extents(family, np.resize(np.arange(family.count), len(u)), plan, u)
-    return notably_broken(family, ran, extent, tolerances)
 
 
 def judged(

@@ -20,7 +20,7 @@ from mjx_drax.search.checkpoint import Checkpoint
 from mjx_drax.search.devices import mesh_for
 from mjx_drax.search.engine import Found, Progress, Search
 from mjx_drax.search.family import Family
-from mjx_drax.search.fitting import Answer, in_a_fitting_box, narrowed
+from mjx_drax.search.fitting import Answer, in_a_fitting_box
 from mjx_drax.search.identity import look_again
 from mjx_drax.search.iterate import Question, feedback_gains, partition, ranking
 from mjx_drax.search.recording import Recorder
@@ -30,7 +30,7 @@ from mjx_drax.search.unlimited import both_of, found_in_steps, is_motion
 from mjx_drax.search.warm import Warm, require_alike
 from mjx_drax.solution.log import history_of
 from mjx_drax.solution.progress import reporting
-from mjx_drax.solution.replay import both_ways, hang_on_room, plan_violations
+from mjx_drax.solution.replay import both_ways, plan_violations
 from mjx_drax.solution.results import stalled_of, tolerance_of
 from mjx_drax.solution.solution import Solution
 from mjx_drax.solution.violations import (
@@ -134,7 +134,7 @@ def solve(
 
         most = math.inf if max_seconds is None else max_seconds
 
-        spent, whole = [0.0, 0.0], problem  # compiling and solving; in the user's box
+        spent = [0.0, 0.0]  # compiling and solving
         live = record is not None and type(record) is not Recorder  # it shows one solve
 
         def solved(problem: Problem) -> Answer[Solution]:
@@ -174,21 +174,14 @@ def solve(
             solution = _certified(problem, settings, seed, found, tolerances)
             if recorder is not None:
                 solution = replace(solution, recording=recorder.recording())
-            best, plans = solution.best_chain, solution.plans.astype(float)
-            knots = jax.tree.map(lambda a: a[best], solution.trajectories)
-            suspect, posed = False, solution.problem
-            if solution.certified and narrowed(whole, posed, plans[best], knots.u, each=True):
-                both_replays = solution.open_loop, solution.feedback
-                asked = plans, np.asarray(solution.trajectories.u), both_replays, tolerances
-                suspect = bool(hang_on_room(Family.of_one(posed), *asked)[best])
+            best = solution.best_chain
             return Answer(
                 solution,
-                posed,
-                plans[best],
-                knots,
+                solution.problem,
+                solution.plans[best],
+                jax.tree.map(lambda a: a[best], solution.trajectories),
                 float(solution.replay_cost[best]) if solution.certified else math.inf,
                 solution.interrupted or spent[1] >= most or live,
-                suspect,
             )
 
         solution = in_a_fitting_box(problem, solved, warn_of_box, tolerance_of(settings))

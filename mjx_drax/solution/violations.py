@@ -77,9 +77,6 @@ SPAN, LEAST = 0.1, 0.02
 """Tolerances of constraints are at most the share `SPAN` of the row's largest value, but at least
 `LEAST` of what they would be without this: a row that asks for what holds anyway is always 0."""
 
-NOTABLE = 0.01
-"""What is broken by more than this share of the row's largest value asks for a look at the room."""
-
 ROUNDED = 0.1
 """Rounding of states above this share of what is tolerated is told."""
 
@@ -93,8 +90,8 @@ MOVE, DIRECTIONS = 1e-2, 16
 """Share of the extent by which knots are moved to see how constraints change, and how often."""
 
 Tolerance = float | Sequence[float] | None
-Limits = tuple[tuple[Array, ...], Array, Array, Array, Array]
-"""Tolerances of each kind in `MEASURED`, the relative one, `STILL`, `LEAST` and `SPAN`."""
+Limits = tuple[tuple[Array, ...], Array, Array]
+"""Tolerances of each kind in `MEASURED`, the relative one, and `STILL`."""
 
 
 @dataclass(frozen=True)
@@ -384,7 +381,7 @@ def warn_of_loose_ends(
         off_by, allowed = (a[certified].astype(float) for a in ends[i])
         loose = (off_by > NOTHING * allowed) & (off_by < LOOSE * allowed)
         if loose.any() and (off_by >= LOOSE * allowed).any():
-            of_motion = _evaluated(*given, still=0.0)[2][i][1][certified]
+            of_motion = _evaluated(*given, least=0.0)[2][i][1][certified]
             loose &= off_by >= LOOSE * of_motion
         if loose.any():
             entry = int(np.argmax(loose))
@@ -521,27 +518,6 @@ def measured(
     )
 
 
-def notably_broken(
-    family: Family,
-    motion: tuple[np.ndarray, np.ndarray],
-    extent: tuple[np.ndarray, ...],
-    tolerances: Tolerances,
-) -> np.ndarray:
-    """Whether motions break constraints by more than `NOTABLE` of a row's largest value, (n,).
-
-    It is tolerated where a coordinate that the row reads has far more room than it uses: `STILL` of
-    that room is many times what the row asks for. Args are those of `measured`.
-    """
-    off = np.zeros((len(motion[0]), family.problem.dynamics.ndx))
-    size, allowed, *_ = _evaluated(
-        family, motion, off, extent, tolerances, least=0.0, span=NOTABLE
-    )[1]
-    kinds = [kind for kind in MEASURED if "equality" in kind]
-    rows = [MEASURED.index(kind) for kind in kinds]
-    broken: np.ndarray = (size[rows] > allowed[rows]).any(axis=0)
-    return broken
-
-
 def inequalities(
     family: Family,
     motion: tuple[np.ndarray, np.ndarray],
@@ -563,21 +539,19 @@ def _evaluated(
     off: np.ndarray,
     extent: tuple[np.ndarray, ...],
     tolerances: Tolerances,
-    still: float = STILL,
-    least: float = LEAST,
-    span: float = SPAN,
+    least: float = STILL,
 ) -> Any:
-    """What `_measured` returns, on the host but for its last arrays."""
+    """What `_measured` returns, on the host but for its last arrays; `least` instead of `STILL`."""
     with family.problem.arithmetic():
-        given = _on_device(family.at(0), motion, off, extent, tolerances, still, least, span)
+        given = _on_device(family.at(0), motion, off, extent, tolerances, least)
         *found, stages = _measured(*family.parts, *given)
         return *jax.tree.map(np.asarray, found), stages
 
 
 def _on_device(problem: Problem, motion: Any, off: Any, extent: Any, *limits: Any) -> Any:
-    """Arguments of `_measured` and `_by_entry`; limits are tolerances and shares."""
-    tolerances, *shares = limits
-    every = motion, off, extent, (tolerances.of(problem), tolerances.relative, *shares)
+    """Arguments of `_measured` and `_by_entry`; limits are tolerances, and `STILL` or less."""
+    tolerances, least = limits
+    every = motion, off, extent, (tolerances.of(problem), tolerances.relative, least)
     with np.errstate(over="ignore"):  # what is beyond float32 is infinite
         return jax.tree.map(lambda a: jnp.asarray(a, problem.x_init.dtype), every)
 
@@ -637,12 +611,12 @@ def _sizes_and_tolerances(
     limits: Limits,
 ) -> Iterator[tuple[Array, Array, int]]:
     """Sizes and tolerances (knots, entries), and the first knot, of each kind in `MEASURED`."""
-    given, relative, still, least, share = limits
-    E = tuple(map(jnp.maximum, extent, (still * width for width in scatter_widths(problem))))
+    given, relative, least = limits
+    E = tuple(map(jnp.maximum, extent, (least * width for width in scatter_widths(problem))))
     parts = _sizes_and_scales(problem, *motion, off, E)
     for (size, scale, span, first), number in zip(parts, given, strict=True):
         allowed = relative * scale
-        allowed = jnp.minimum(allowed, jnp.maximum(share * span, least * allowed))
+        allowed = jnp.minimum(allowed, jnp.maximum(SPAN * span, LEAST * allowed))
         allowed = jnp.where(jnp.isnan(number), allowed, number)
         yield size, jnp.broadcast_to(allowed, size.shape), first
 
@@ -747,7 +721,7 @@ def by_entry(
         extent: of the plan, from `extents`, without its first axis.
     """
     with problem.arithmetic():
-        given = _on_device(problem, motion, off, extent, tolerances, STILL, LEAST, SPAN)
+        given = _on_device(problem, motion, off, extent, tolerances, STILL)
         found = jax.tree.map(np.asarray, _by_entry(problem, *given))
     return [
         violation

@@ -62,19 +62,8 @@ def test_a_box_of_which_something_is_used_stays():
     assert narrowed(by_knot, by_knot, x, u) is None
 
 
-def test_a_suspect_motion_gets_a_box_that_fits_each_of_its_entries():
-    x, u = motion([9.0, 1.0], [2.0, 0.0])
-    used = point(x_bounds=([-1e6, -2.0], [1e6, 2.0]), u_bounds=(-5.0, 5.0))
-    assert narrowed(used, used, x, u) is None
-    problem, which = narrowed(used, used, x, u, each=True)
-    assert which.tolist() == [True, False, False, False]  # what rests, the last, stays
-    np.testing.assert_allclose(boxes(problem)[0][1], [2000.0, 2.0], rtol=1e-6)
-    again, _ = narrowed(used, problem, x, u, each=True)
-    assert boxes(again)[0] == [[-90.0, -2.0], [90.0, 2.0]]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("wide", "there"), [(1e6, -0.5), (1e8, -0.5), (1e6, 8.0)])
+@pytest.mark.parametrize(("wide", "there"), [(1e4, -0.5), (1e5, 8.0), (1e6, 8.0)])
 def test_bounds_that_mean_none_do_not_make_anything_feasible(wide, there):
     problem = from_function(
         lambda x, u: x + 0.05 * jnp.stack([x[1], u[0]]), x_init=[0.0, 0.0], nu=1, dt=0.05,
