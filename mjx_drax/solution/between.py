@@ -31,13 +31,19 @@ def broken_between_knots(solution: Results, chain: int) -> Violation | None:
     ran = solution.replays_in(solution.mode_of(chain))
     states, u = ran.states[chain], ran.controls[chain]
     between = dynamics.between_knots(states[:-1], u).swapaxes(0, 1)
-    before = np.repeat(states[None], len(between), axis=0)
-    other, last = before.copy(), before.copy()
-    before[:, :-1], other[:, 1:-1], last[:, -3] = between, between[:, :-1], between[:, -1]
-    asked = _at_stages(solution, chain, np.concatenate([before, other, last]), u)
-    (size, *sizes), (allowed, *most) = (np.split(of_all, 3) for of_all in asked)
-    of_other = (np.concatenate([b[:, 1:], c[:, -2:-1]], axis=1) for b, c in (sizes, most))
-    size, allowed = np.minimum(size, next(of_other)), np.maximum(allowed, next(of_other))
+    # Stage k is asked about the time after its own knot, then about the time before it, and the
+    # stage before the last about the time after the last
+    after = np.repeat(states[None], len(between), axis=0)
+    before, at_end = after.copy(), after.copy()
+    after[:, :-1], before[:, 1:-1], at_end[:, -3] = between, between[:, :-1], between[:, -1]
+
+    def of_both(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the two stages that are asked about the time after knot k say, (n, K, entries)."""
+        by_first, by_next, by_last = np.split(found, 3)
+        return by_first, np.concatenate([by_next[:, 1:], by_last[:, -2:-1]], axis=1)
+
+    sizes, tolerated = _at_stages(solution, chain, np.concatenate([after, before, at_end]), u)
+    size, allowed = np.minimum(*of_both(sizes)), np.maximum(*of_both(tolerated))
     if not (size > allowed).any():
         return None
     share = np.where(size > allowed, size / np.maximum(allowed, np.finfo(float).tiny), 0.0)

@@ -129,14 +129,15 @@ def followed(
     states = np.where(better[:, None, None], open_loop.states, feedback.states)
     replayed = np.where(better, open_loop.cost, feedback.cost)
     with np.errstate(invalid="ignore"):  # of plans that are not finite
-        try:
-            away, which = problem.dynamics.host_difference(states, plan), 1
-            moves = extents(problem, plan, open_loop.controls)[which]
-        except DraxError:  # of a user's own states, which are not known where this is loaded
-            away, which = states - plan, 0
-            moves = np.ptp(plan, axis=1)
         with problem.arithmetic():
-            moves = np.maximum(moves, STILL * np.asarray(scatter_widths(problem)[which]))
+            of_states, of_differences, _ = scatter_widths(problem)
+        try:
+            away, width = problem.dynamics.host_difference(states, plan), of_differences
+            moves = extents(problem, plan, open_loop.controls)[1]
+        except DraxError:  # loaded without the problem, whose differences are a user's own code
+            away, width = states - plan, of_states
+            moves = np.ptp(plan, axis=1)
+        moves = np.maximum(moves, STILL * np.asarray(width))
         off = np.abs(away).max(axis=1, initial=0.0)
         most = np.maximum(np.abs(cost), np.abs(replayed))
         alike: np.ndarray = np.abs(replayed - cost) <= FOLLOWED * most
